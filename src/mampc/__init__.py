@@ -1,0 +1,53 @@
+"""mampc: minimum-attention model predictive control, which tracks with few actuator moves.
+
+See README.md for ten lines that run, docs/ for the rest.
+"""
+
+from mampc import plants
+from mampc.controllers import MAMPC, MPC, Alternating, ControllerState, Decision, Status
+from mampc.errors import MampcError, MampcWarning, StudyError
+from mampc.estimation import KalmanFilter
+from mampc.identification import Identified, IOData, Validation, excite, n4sid, validate
+from mampc.lti import StateSpace, linearise
+from mampc.metrics import Metrics
+from mampc.names import Names
+from mampc.patterns import MoveRules
+from mampc.problem import Limits, TrackingProblem
+from mampc.regulator import Regulator, RegulatorState
+from mampc.signals import prbs, steps
+from mampc.simulation import Run, simulate
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "MAMPC",
+    "MPC",
+    "Alternating",
+    "ControllerState",
+    "Decision",
+    "IOData",
+    "Identified",
+    "KalmanFilter",
+    "Limits",
+    "MampcError",
+    "MampcWarning",
+    "Metrics",
+    "MoveRules",
+    "Names",
+    "Regulator",
+    "RegulatorState",
+    "Run",
+    "StateSpace",
+    "Status",
+    "StudyError",
+    "TrackingProblem",
+    "Validation",
+    "excite",
+    "linearise",
+    "n4sid",
+    "plants",
+    "prbs",
+    "simulate",
+    "steps",
+    "validate",
+]

@@ -1,0 +1,323 @@
+"""Condensing: the tracking problem as a dense quadratic program in the moves.
+
+With the step response S_i = D + sum_{k<i} C A^k B of the model, the predicted outputs are
+
+    y_i = free_i + sum_{j <= min(i, nc-1)} S_{i-j} du_j
+    free_i = y_op + C A^i x + S_i (u_prev + d_u - u_op) + d_y        (no more moves)
+
+with constant disturbances d_u at the inputs and d_y at the outputs. With `theta` the lower
+block-triangular matrix of step responses and error = r - free
+
+    cost = |error - theta d|^2_Q + |d|^2_R = 1/2 d' H d + f' d + |error|^2_Q
+    H = 2 (theta' Q theta + R),   f = -2 theta' Q error,   d = (du_0, ..., du_{nc-1}).
+
+Everything that changes from sample to sample (f, the bounds, the error, and the optimum as long as no
+limit is active) is affine in the parameter p = (x, u_prev, d_u, d_y, 1, r): one matrix-vector product.
+Where outputs are limited, one violation per limited output stands before the moves: z = (violations, d).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.arrays import Array, BoolArray, ComplexArray
+from mampc.problem import TrackingProblem
+from mampc.qp import UNBOUNDED, QuadraticProgram
+
+
+class Parts(NamedTuple):
+    """Where each quantity stands in an instance's data."""
+
+    margins: slice
+    moves: slice
+    inputs: slice
+    residual: slice
+    f: slice
+    f_moves: slice
+    error: slice
+    lower: slice
+    upper: slice
+
+
+class Instance:
+    """One sample's data, as views into one array; symbols as in the module's docstring.
+
+    The first four belong to the optimum without limits: how far it stays from each bound (negative where
+    it breaks one), its moves d, its inputs u_0 .. u_{nc-1}, and a vector whose squared length is its cost.
+    """
+
+    __slots__ = ("data", "parts", "u_previous")
+
+    def __init__(self, data: Array, parts: Parts, u_previous: Array) -> None:
+        self.data, self.parts, self.u_previous = data, parts, u_previous
+
+    @property
+    def margins(self) -> Array:
+        return self.data[self.parts.margins]
+
+    @property
+    def unlimited_moves(self) -> Array:
+        return self.data[self.parts.moves]
+
+    @property
+    def unlimited_inputs(self) -> Array:
+        return self.data[self.parts.inputs]
+
+    @property
+    def unlimited_cost(self) -> float:
+        residual = self.data[self.parts.residual]
+        return float(residual.dot(residual))
+
+    @property
+    def f(self) -> Array:
+        """Linear term of the program, shape (n_variables,)."""
+        return self.data[self.parts.f]
+
+    @property
+    def f_moves(self) -> Array:
+        """Its entries for the moves, shape (n_moves,)."""
+        return self.data[self.parts.f_moves]
+
+    @property
+    def error(self) -> Array:
+        """Q^(1/2) (r - free), shape ((np + 1) l,)."""
+        return self.data[self.parts.error]
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds of the program, shape (n_bounds,)."""
+        return self.data[self.parts.lower]
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds of the program, shape (n_bounds,)."""
+        return self.data[self.parts.upper]
+
+
+class Restriction(NamedTuple):
+    """A program on some of the moves (the others are zero), and where its data stand in the full one."""
+
+    program: QuadraticProgram
+    columns: np.ndarray[tuple[int], np.dtype[np.intp]]
+    bounds: np.ndarray[tuple[int], np.dtype[np.intp]]
+
+
+class CondensedQP:
+    """The condensed form of a `TrackingProblem`; the module's docstring defines every symbol.
+
+    Attributes:
+        program: the `QuadraticProgram` in z = (violations, d); d is time-major, n_moves = nc * m.
+        H: its block for the moves, shape (n_moves, n_moves).
+        theta: predicted outputs per move, shape ((np + 1) l, n_moves).
+        cumulate: u_j - u_prev per move, shape (n_moves, n_moves).
+
+    Raises:
+        MampcError: the moves are not all determined by the weights (H is singular).
+    """
+
+    def __init__(self, problem: TrackingProblem) -> None:
+        self.problem = problem
+        model, n_p, n_c = problem.model, problem.prediction_horizon, problem.control_horizon
+        m, l = model.n_inputs, model.n_outputs
+        self.n_moves = n_c * m
+        self.cumulate = np.kron(np.tri(n_c), np.eye(m))
+
+        observed = [model.C]  # C A^i
+        for _ in range(n_p):
+            observed.append(observed[-1] @ model.A)
+        step = np.cumsum([model.D] + [rows @ model.B for rows in observed[:-1]], axis=0)  # S_i
+        self.theta = np.zeros(((n_p + 1) * l, self.n_moves))
+        for j in range(n_c):
+            self.theta[j * l :, j * m : (j + 1) * m] = step[: n_p + 1 - j].reshape(-1, m)
+
+        root = np.kron(np.eye(n_p + 1), _square_root(problem.output_weight))
+        self.weighted_theta = root @ self.theta
+        self.R = np.kron(np.eye(n_c), problem.move_weight)
+        if not problem.weigh_first_move:
+            self.R[:m, :m] = 0.0
+        H = 2 * (self.weighted_theta.T @ self.weighted_theta + self.R)
+        self.H = (H + H.T) / 2
+
+        # Affine maps of p = (x, u_prev, d_u, d_y, 1, r), for a previewed reference.
+        ones, inputs = np.tile(np.eye(l), (n_p + 1, 1)), step.reshape(-1, m)
+        none = np.zeros(((n_p + 1) * l, ones.shape[0]))
+        offset = np.tile(model.y_op, n_p + 1) - inputs @ model.u_op
+        free = np.hstack([np.concatenate(observed), inputs, inputs, ones, offset[:, None], none])
+        self._one_at = free.shape[1] - len(none) - 1
+        error = -free
+        error[:, self._one_at + 1 :] = np.eye(len(none))
+        u_previous = np.zeros((m, free.shape[1]))
+        u_previous[:, model.n_states : model.n_states + m] = np.eye(m)
+
+        lower, upper = self._build_program(free, u_previous)
+        error = root @ error
+        f = np.zeros((self.program.n_variables, free.shape[1]))
+        f[: self.n_violations, self._one_at] = problem.output_limit_weight
+        f[self.n_violations :] = -2 * self.weighted_theta.T @ error
+        moves = -np.linalg.solve(self.H, f[self.n_violations :])
+        at_optimum = self.bounded_rows @ moves
+        v = self.n_violations
+        self._preview_map, self.parts = _stacked(
+            margins=np.concatenate([at_optimum - lower[v:], upper[v:] - at_optimum]),
+            moves=moves,
+            inputs=np.tile(u_previous, (n_c, 1)) + self.cumulate @ moves,
+            residual=np.concatenate([error - self.weighted_theta @ moves, _square_root(self.R) @ moves]),
+            f=f,
+            f_moves=f[v:],
+            error=error,
+            lower=lower,
+            upper=upper,
+        )
+        self._constant_map = self._with_constant_reference(self._preview_map)
+        self._undisturbed = np.repeat([0.0, 1.0], [m + l, 1])  # (d_u, d_y, 1)
+
+    def _build_program(self, free: Array, u_previous: Array) -> tuple[Array, Array]:
+        """The program, and its bounds as affine maps.
+
+        Rows: violations and moves (simple), then inputs after the first sample, then outputs.
+        """
+        problem, limits = self.problem, self.problem.limits
+        m, l, n_c, n = problem.model.n_inputs, problem.model.n_outputs, problem.control_horizon, self.n_moves
+        limited = np.isfinite(limits.y_min) | np.isfinite(limits.y_max)
+        self.n_violations = v = int(limited.sum())
+        # With move limits every move has a simple bound and every input a row; without, the first inputs'
+        # limits are simple bounds of the first moves.
+        moves_limited = bool(np.isfinite(limits.du_max).any())
+        n_simple = v + (n if moves_limited else m)
+        skipped = 0 if moves_limited else m
+        inputs = np.flatnonzero(np.tile(np.isfinite(limits.u_min) | np.isfinite(limits.u_max), n_c))
+        inputs = inputs[inputs >= skipped]
+        # theta d - e <= y_max - free and theta d + e >= y_min - free at i = 1..np, e that output's violation.
+        predicted = np.arange(l, len(self.theta))
+        self._above = predicted[np.isfinite(limits.y_max)[predicted % l]]
+        self._below = predicted[np.isfinite(limits.y_min)[predicted % l]]
+        violation = np.eye(v)[np.maximum(np.cumsum(limited) - 1, 0)] if v else np.zeros((l, 0))
+        A = np.block(
+            [
+                [np.zeros((len(inputs), v)), self.cumulate[inputs]],
+                [-violation[self._above % l], self.theta[self._above]],
+                [violation[self._below % l], self.theta[self._below]],
+            ]
+        )
+        H = np.block([[problem.output_limit_weight * np.eye(v), np.zeros((v, n))], [np.zeros((n, v)), self.H]])
+        self.program = QuadraticProgram(H, A, n_simple)
+        self.bounded_rows = np.vstack([np.eye(n_simple - v, n), A[:, v:]])
+        self._move_of_bound = np.full(n_simple + len(A), -1)  # the move that makes an input row new, else -1
+        self._move_of_bound[n_simple : n_simple + len(inputs)] = inputs
+        self._above_rows = n_simple + len(inputs) + np.arange(len(self._above))
+        self._below_rows = self._above_rows.size + n_simple + len(inputs) + np.arange(len(self._below))
+
+        lower, one = np.zeros((n_simple + len(A), free.shape[1])), self._one_at
+        lower[:, one] = -UNBOUNDED
+        upper = -lower
+        lower[:v, one] = 0.0
+        u_min, u_max = np.maximum(limits.u_min, -UNBOUNDED), np.minimum(limits.u_max, UNBOUNDED)
+        if moves_limited:
+            upper[v:n_simple, one] = np.tile(np.minimum(limits.du_max, UNBOUNDED), n_c)
+            lower[v:n_simple, one] = -upper[v:n_simple, one]
+        else:
+            lower[v:n_simple], upper[v:n_simple] = -u_previous, -u_previous
+            lower[v:n_simple, one], upper[v:n_simple, one] = u_min, u_max
+        of_inputs = slice(n_simple, n_simple + len(inputs))
+        lower[of_inputs], upper[of_inputs] = -u_previous[inputs % m], -u_previous[inputs % m]
+        lower[of_inputs, one], upper[of_inputs, one] = u_min[inputs % m], u_max[inputs % m]
+        upper[self._above_rows] = -free[self._above]
+        upper[self._above_rows, one] += limits.y_max[self._above % l]
+        lower[self._below_rows] = -free[self._below]
+        lower[self._below_rows, one] += limits.y_min[self._below % l]
+        return lower, upper
+
+    def _with_constant_reference(self, preview_map: Array) -> Array:
+        """The map for one reference (l,) that holds over the horizon."""
+        reference = self._one_at + 1
+        constant = preview_map[:, reference:].reshape(len(preview_map), -1, self.problem.model.n_outputs).sum(axis=1)
+        return np.hstack([preview_map[:, :reference], constant])
+
+    def instance(
+        self,
+        x: Array,
+        u_previous: Array,
+        reference: Array,
+        output_disturbance: Array | None = None,
+        input_disturbance: Array | None = None,
+    ) -> Instance:
+        """The data of one sample; the reference has shape (l,) or (np + 1, l)."""
+        disturbances = self._undisturbed
+        if output_disturbance is not None or input_disturbance is not None:
+            disturbances = disturbances.copy()
+            m = len(u_previous)
+            if input_disturbance is not None:
+                disturbances[:m] = input_disturbance
+            if output_disturbance is not None:
+                disturbances[m:-1] = output_disturbance
+        if reference.ndim == 1:
+            data = self._constant_map.dot(np.concatenate((x, u_previous, disturbances, reference)))
+        else:
+            data = self._preview_map.dot(np.concatenate((x, u_previous, disturbances, reference.ravel())))
+        return Instance(data, self.parts, u_previous)
+
+    def cost(self, instance: Instance, moves: Array) -> float:
+        """Tracking cost plus move weights plus output-limit penalty of the moves d, shape (n_moves,)."""
+        residual = instance.error - self.weighted_theta @ moves
+        cost = residual @ residual + moves @ self.R @ moves
+        if self.n_violations:
+            e = self.violations(instance, moves)
+            cost += self.problem.output_limit_weight * (e.sum() + 0.5 * (e @ e))
+        return float(cost)
+
+    def violations(self, instance: Instance, moves: Array) -> Array:
+        """Largest predicted excess over its limits of each output over i = 1..np, shape (l,)."""
+        l = self.problem.model.n_outputs
+        excess = np.zeros(l)
+        above = self.theta[self._above] @ moves - instance.upper[self._above_rows]
+        below = instance.lower[self._below_rows] - self.theta[self._below] @ moves
+        np.maximum.at(excess, self._above % l, above)
+        np.maximum.at(excess, self._below % l, below)
+        return excess
+
+    def restricted(self, pattern: BoolArray) -> Restriction:
+        """The program on the moves where `pattern`, shape (n_moves,), is true; the others are zero.
+
+        Input rows at samples where that input does not move repeat earlier ones and are left out.
+        """
+        v, full = self.n_violations, self.program
+        kept = np.concatenate([np.ones(v, dtype=bool), pattern])
+        columns = np.flatnonzero(kept)
+        move = self._move_of_bound
+        bound_kept = np.where(move < 0, True, pattern[np.maximum(move, 0)])
+        bound_kept[: full.n_simple] = kept[: full.n_simple]
+        bounds = np.flatnonzero(bound_kept)
+        n_simple = int(kept[: full.n_simple].sum())
+        rows = bounds[n_simple:] - full.n_simple
+        program = QuadraticProgram(full.H[np.ix_(columns, columns)], full.A[np.ix_(rows, columns)], n_simple)
+        return Restriction(program, columns, bounds)
+
+    def closed_loop_poles(self) -> ComplexArray:
+        """Poles, shape (n + m,), of model and unlimited receding-horizon law, state (x, u_prev)."""
+        model = self.problem.model
+        n, m = model.n_states, model.n_inputs
+        feedback = self._preview_map[self.parts.moves][:m, : n + m]
+        open_loop = np.block([[model.A, model.B], [np.zeros((m, n)), np.eye(m)]])
+        return np.linalg.eigvals(open_loop + np.vstack([model.B, np.eye(m)]) @ feedback).astype(complex)
+
+
+def _stacked(**maps: Array) -> tuple[Array, Parts]:
+    """The affine maps in one matrix, and where each stands in it; f_moves is the end of f."""
+    at, start = {}, 0
+    for name, rows in maps.items():
+        if name == "f_moves":
+            at[name] = slice(start - len(rows), start)
+            continue
+        at[name] = slice(start, start + len(rows))
+        start += len(rows)
+    together = np.vstack([rows for name, rows in maps.items() if name != "f_moves"])
+    return np.ascontiguousarray(together), Parts(**at)
+
+
+def _square_root(weight: Array) -> Array:
+    """The symmetric S with S' S = weight, a positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(weight)
+    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root

@@ -1,0 +1,168 @@
+"""The step all controllers share: check, condense, plan, decide. Methods differ only in the plan."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mampc.arrays import Array, as_vector
+from mampc.condensing import CondensedQP, Instance
+from mampc.controllers.decision import ControllerState, Decision, Status
+from mampc.errors import MampcError
+from mampc.problem import TrackingProblem
+from mampc.qp import QPStatus
+from mampc.qp_daqp import DaqpSolver
+
+HELD_BY = {
+    QPStatus.INFEASIBLE: Status.HELD_INFEASIBLE,
+    QPStatus.BAD_DATA: Status.HELD_INFEASIBLE,  # data are finite here, so bounds crossed
+    QPStatus.ITERATION_LIMIT: Status.HELD_SOLVER_FAILED,
+    QPStatus.TIME_LIMIT: Status.HELD_SOLVER_FAILED,
+    QPStatus.FAILED: Status.HELD_SOLVER_FAILED,
+}
+
+
+INSIDE = 1e-9  # input units; a distance to a limit that no rounding can make up
+
+
+class Plan(NamedTuple):
+    """A method's answer: moves d (n_moves,) or None, how it ended, a proven bound, and its next guess.
+
+    `lower_bound` None means that the plan is proven optimal: its own objective is the bound. Inputs
+    (n_moves,) within their limits and the objective are worked out from the moves where not at hand.
+    """
+
+    moves: Array | None
+    status: Status
+    iterations: int
+    lower_bound: float | None = -np.inf
+    guess: Array | None = None
+    inputs: Array | None = None
+    objective: float | None = None
+
+
+class Controller(ABC):
+    """A receding-horizon controller: `step` is pure, all memory is in the state it takes and returns.
+
+    Args:
+        problem: what to track, over which horizons, at what weights and within what limits.
+    """
+
+    def __init__(self, problem: TrackingProblem) -> None:
+        if not isinstance(problem, TrackingProblem):
+            raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
+        self.problem = problem
+        self.condensed = CondensedQP(problem)
+        self._solver = DaqpSolver(self.condensed.program)
+        limits, model = problem.limits, problem.model
+        self._u_min, self._u_max = limits.u_min, limits.u_max
+        self._shape = (problem.control_horizon, model.n_inputs)
+        self._x_shape = (model.n_states,)
+        self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
+
+    @property
+    def memory(self) -> int:
+        """How many past inputs the controller looks back on."""
+        return 1
+
+    def initial_state(self, u_previous: Any = None) -> ControllerState:
+        """The state before the first sample.
+
+        Args:
+            u_previous: inputs applied so far, shape (m,) or (h, m) with the latest last; default the
+                operating point. Missing earlier inputs are taken to have been the same.
+        """
+        m = self.problem.model.n_inputs
+        u = np.asarray(self.problem.model.u_op if u_previous is None else u_previous, dtype=float)
+        if u.ndim == 2 and u.shape[0] >= 1:
+            past = np.stack([as_vector("u_previous", row, m) for row in u])
+        else:
+            past = as_vector("u_previous", u, m)[None]
+        missing = max(0, self.memory - len(past))
+        past = np.concatenate([np.repeat(past[:1], missing, axis=0), past])
+        return ControllerState(past[-self.memory :])
+
+    def step(
+        self,
+        state: ControllerState,
+        x: Any,
+        reference: Any,
+        *,
+        output_disturbance: Array | None = None,
+        input_disturbance: Array | None = None,
+    ) -> Decision:
+        """Decide the inputs of this sample.
+
+        Args:
+            state: from `initial_state` or the previous decision.
+            x: the model's (deviation) state, shape (n,).
+            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
+            output_disturbance: added to every predicted output, shape (l,).
+            input_disturbance: added to every input of the model, shape (m,).
+
+        Returns:
+            A `Decision`. Numbers that are not finite lead to a held input and a status, never to an error.
+
+        Raises:
+            MampcError: arrays of the wrong shape.
+        """
+        start = perf_counter()
+        x = np.asarray(x, dtype=np.float64)
+        reference = np.asarray(reference, dtype=np.float64)
+        if x.shape != self._x_shape:
+            raise MampcError(f"x: expected shape {self._x_shape}, received {x.shape}")
+        if reference.shape not in self._reference_shapes:
+            raise MampcError(f"reference: expected shape {self._reference_shapes}, received {reference.shape}")
+        instance = self.condensed.instance(x, state.inputs[-1], reference, output_disturbance, input_disturbance)
+        return self._decide(self._plan(instance, state), instance, state, start)
+
+    @abstractmethod
+    def _plan(self, instance: Instance, state: ControllerState) -> Plan:
+        """Search the moves for one sample's data."""
+
+    def _price(self, changes: Array) -> float:
+        """What the moves cost beside the quadratic program."""
+        return 0.0
+
+    def _decide(self, plan: Plan, instance: Instance, state: ControllerState, start: float) -> Decision:
+        moves, status, iterations, lower_bound, guess, inputs, objective = plan
+        u_previous = instance.u_previous
+        if moves is None:
+            moves = np.zeros(self.condensed.n_moves)
+            objective, lower_bound = np.nan, -np.inf
+        elif objective is None:
+            objective = self.condensed.cost(instance, moves)
+        if lower_bound is None:
+            lower_bound = objective
+        if inputs is None:
+            inputs = self.condensed.cumulate @ moves
+            inputs.reshape(self._shape)[...] += u_previous
+            inputs = np.minimum(np.maximum(inputs.reshape(self._shape), self._u_min), self._u_max)
+        else:
+            inputs = inputs.reshape(self._shape)
+        u, history = inputs[0], state.inputs
+        history = inputs[:1] if len(history) == 1 else np.concatenate((history[1:], inputs[:1]))
+        return Decision(
+            u, inputs, moves.reshape(self._shape), status, objective, lower_bound, iterations,
+            perf_counter() - start, ControllerState(history, state.samples + 1, guess),
+        )  # fmt: skip
+
+    def _unrestricted(self, instance: Instance) -> Plan:
+        """Plain MPC: every move is free. Where no limit is active the optimum is at hand already."""
+        margins = instance.margins
+        # Inside by more than rounding; false for any not-a-number, which is looked at more closely below.
+        if margins[margins.argmin()] > INSIDE:
+            return Plan(
+                instance.unlimited_moves, Status.OPTIMAL, 0, None, None,
+                instance.unlimited_inputs, instance.unlimited_cost,
+            )  # fmt: skip
+        f = instance.f
+        if not f @ f < np.inf:
+            return Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
+        solution = self._solver.solve(f, instance.lower, instance.upper)
+        if solution.z is None:
+            return Plan(None, HELD_BY[solution.status], solution.iterations)
+        return Plan(solution.z[self.condensed.n_violations :], Status.OPTIMAL, solution.iterations, None)

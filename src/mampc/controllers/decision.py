@@ -1,0 +1,96 @@
+"""What a controller answers at every sample, and what it remembers until the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mampc.arrays import Array, BoolArray
+
+
+class Status(StrEnum):
+    """How a decision came about; `status.sentence` says it in words."""
+
+    sentence: str
+
+    def __new__(cls, value: str, sentence: str) -> Status:
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.sentence = sentence
+        return member
+
+    OPTIMAL = "optimal", "The plan is proven to be the best one."
+    FEASIBLE = "feasible", "The plan keeps every limit and rule; a better one may exist."
+    SETTLED = "settled", "The method settled; moves off its pattern are small, not zero (see polish)."
+    WARM_UP = "warm_up", "Plain MPC, while the sparse method waits for its first past inputs."
+    ITERATION_LIMIT = "iteration_limit", "The method stopped at its iteration cap before it settled."
+    TIME_LIMIT = "time_limit", "The method stopped at its time limit with the best plan so far."
+    HELD_INFEASIBLE = "held_infeasible", "No plan keeps the limits: the previous inputs are held."
+    HELD_BAD_MEASUREMENT = (
+        "held_bad_measurement",
+        "A state, measurement or reference was not a usable number: the previous inputs are held.",
+    )
+    HELD_SOLVER_FAILED = "held_solver_failed", "The solver failed: the previous inputs are held."
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerState:
+    """What a controller remembers: plain numbers, safe to copy, pickle and compare.
+
+    Attributes:
+        inputs: the inputs applied so far, oldest first, shape (h, m); the last row is u_{k-1}.
+        samples: how many samples have been decided.
+        guess: a method's starting point for the next sample, shape (nc, m), or None.
+    """
+
+    inputs: Array
+    samples: int = 0
+    guess: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """One sample's decision, in engineering units.
+
+    Attributes:
+        u: inputs to apply now, shape (m,); always finite and within the input limits.
+        plan: planned inputs, shape (nc, m); its first row is `u`.
+        changes: planned moves du, shape (nc, m); entries off the chosen pattern are exactly zero.
+        status: how the decision came about.
+        objective: cost of the plan: tracking over i = 0..np, move weights over j = 0..nc-1, output-limit
+            penalty and price of the moves; not-a-number where nothing was solved.
+        lower_bound: no admissible plan costs less; minus infinity where nothing is proven.
+        iterations: solver iterations (MPC) or rounds of the method.
+        solve_time: seconds from call to answer.
+        state: the controller's state for the next sample.
+    """
+
+    u: Array
+    plan: Array
+    changes: Array
+    status: Status
+    objective: float
+    lower_bound: float
+    iterations: int
+    solve_time: float
+    state: Any
+
+    @property
+    def gap(self) -> float:
+        """objective - lower_bound, in units of cost: 0 when proven optimal, infinite when nothing is proven."""
+        gap = self.objective - self.lower_bound
+        return max(0.0, gap) if gap == gap else np.inf
+
+    @cached_property
+    def moves(self) -> BoolArray:
+        """Which planned changes are moves (not zero), shape (nc, m)."""
+        return self.changes != 0.0
+
+    @property
+    def held(self) -> bool:
+        """True when nothing could be planned and the previous inputs are held."""
+        return self.status.startswith("held")

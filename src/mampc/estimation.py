@@ -1,0 +1,164 @@
+"""State estimation: a Kalman filter with integrating disturbances, so that tracking has no offset.
+
+Source: Pannocchia and Rawlings, AIChE Journal 49 (2003): as many integrating disturbances as outputs,
+estimated with the state, remove steady offset under any constant model error or load.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mampc.arrays import Array, as_vector
+from mampc.errors import MampcError
+from mampc.lti import StateSpace
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The model state (n,) and the constant disturbances seen at its outputs (l,) and inputs (m,)."""
+
+    x: Array
+    output_disturbance: Array
+    input_disturbance: Array
+
+
+class KalmanFilter:
+    """A stationary Kalman filter for a model augmented with integrating disturbances.
+
+    Build it with `offset_free`. The gain is that of the stationary error covariance.
+    """
+
+    def __init__(self, model: StateSpace, kind: str, gain: Array) -> None:
+        self.model, self.kind, self.gain = model, kind, gain
+
+    @classmethod
+    def offset_free(
+        cls,
+        model: StateSpace,
+        *,
+        disturbance: str = "output",
+        measurement_noise: Any = 1.0,
+        drift: Any = 0.3,
+        input_noise: Any = None,
+    ) -> KalmanFilter:
+        """A filter with one integrating disturbance per output.
+
+        Only ratios of the three standard deviations matter, so that the defaults suit any units: they
+        filter noise over some three to ten samples.
+
+        Args:
+            model: a discrete model.
+            disturbance: "output" for steps at the outputs (stable models), "input" for steps at the
+                inputs (integrating models too; needs at least as many inputs as outputs).
+            measurement_noise: standard deviation of the noise of each output, scalar or (l,).
+            drift: standard deviation by which each disturbance wanders in a sample, in the unit of
+                `measurement_noise` (for "input": as seen through the model's gain), scalar or (l,)/(m,).
+            input_noise: standard deviation of noise at the inputs, scalar or (m,), in input units; the
+                default is what moves the outputs at rest by about the measurement noise.
+
+        Raises:
+            MampcError: a continuous model, or one whose disturbances cannot be told apart from its
+                states with these outputs.
+        """
+        if not model.is_discrete:
+            raise MampcError("offset_free: expected a discrete model, received dt = 0; discretise it first")
+        if disturbance not in ("output", "input"):
+            raise MampcError(f"disturbance: expected 'output' or 'input', received {disturbance!r}")
+        n, m, l = model.n_states, model.n_inputs, model.n_outputs
+        at_output = disturbance == "output"
+        d = l if at_output else m
+        if not at_output and m < l:
+            raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")
+        A, C = _augmented(model, at_output)
+        _require_detectable(A, C, at_output)
+        noise = _positive("measurement_noise", measurement_noise, l)
+        size = _gain_size(model)
+        excitation = noise.mean() / size if input_noise is None else _positive("input_noise", input_noise, m)
+        wander = _positive("drift", drift, d) * (1.0 if at_output else 1 / size)
+        from scipy.linalg import solve_discrete_are
+
+        driven = model.B * excitation
+        Q = np.zeros((n + d, n + d))
+        Q[:n, :n] = driven @ driven.T + 1e-10 * np.trace(driven @ driven.T) * np.eye(n)
+        Q[n:, n:] = np.diag(wander**2)
+        R = np.diag(noise**2)
+        try:
+            P = solve_discrete_are(A.T, C.T, Q, R)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise MampcError(f"offset_free: expected a detectable model, the Riccati equation failed: {error}") from None
+        gain = np.linalg.solve(C @ P @ C.T + R, C @ P).T
+        return cls(model, disturbance, gain)
+
+    def initial(self, u: Array, y: Any = None) -> Estimate:
+        """At rest under inputs u (m,); with measurements y (l,) the output disturbance explains them."""
+        model = self.model
+        x = model.steady_state(u)
+        d = np.zeros(model.n_outputs)
+        if y is not None and self.kind == "output":
+            d = as_vector("y", y, model.n_outputs) - self._output(x, u, d)
+        return Estimate(x, d, np.zeros(model.n_inputs))
+
+    def predict(self, last: Estimate, u: Array) -> Estimate:
+        """One sample on, with the inputs u (m,) applied since; disturbances stay."""
+        model = self.model
+        x = model.A @ last.x + model.B @ (u - model.u_op + last.input_disturbance)
+        return Estimate(x, last.output_disturbance, last.input_disturbance)
+
+    def correct(self, predicted: Estimate, u: Array, y: Array) -> Estimate:
+        """Correct with measurements y (l,), taken just before the inputs u (m,) are replaced."""
+        innovation = y - self._output(predicted.x, u + predicted.input_disturbance, predicted.output_disturbance)
+        correction = self.gain @ innovation
+        n = self.model.n_states
+        x = predicted.x + correction[:n]
+        if self.kind == "output":
+            return Estimate(x, predicted.output_disturbance + correction[n:], predicted.input_disturbance)
+        return Estimate(x, predicted.output_disturbance, predicted.input_disturbance + correction[n:])
+
+    def _output(self, x: Array, u: Array, disturbance: Array) -> Array:
+        model = self.model
+        y: Array = model.y_op + model.C @ x + model.D @ (u - model.u_op) + disturbance
+        return y
+
+
+def _augmented(model: StateSpace, at_output: bool) -> tuple[Array, Array]:
+    """A and C of the model with integrating disturbances as further states."""
+    n, m, l = model.n_states, model.n_inputs, model.n_outputs
+    if at_output:
+        A = np.block([[model.A, np.zeros((n, l))], [np.zeros((l, n)), np.eye(l)]])
+        return A, np.hstack([model.C, np.eye(l)])
+    A = np.block([[model.A, model.B], [np.zeros((m, n)), np.eye(m)]])
+    return A, np.hstack([model.C, model.D])
+
+
+def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
+    """Every mode that does not decay must show in the outputs (Hautus test)."""
+    n = len(A)
+    scale = max(1.0, float(np.abs(C).max()))
+    for pole in np.linalg.eigvals(A):
+        if abs(pole) >= 1 - 1e-9:
+            seen = np.linalg.svd(np.vstack([A - pole * np.eye(n), C / scale]), compute_uv=False)[-1]
+            if seen < 1e-9:
+                hint = "; for an integrating model use disturbance='input'" if at_output else ""
+                raise MampcError(
+                    "offset_free: expected states and disturbances observable from the outputs, received a "
+                    f"model whose mode at {pole:.4g} cannot be told from a disturbance{hint}"
+                )
+
+
+def _gain_size(model: StateSpace) -> float:
+    """A typical output change per unit of input: root mean square of the dc gain, or of 100 samples' response."""
+    try:
+        gain = model.dc_gain()
+    except MampcError:
+        gain = np.sum([model.C @ np.linalg.matrix_power(model.A, k) @ model.B for k in range(100)], axis=0)
+    return float(np.sqrt(np.mean(gain**2))) or 1.0
+
+
+def _positive(name: str, value: Any, size: int) -> Array:
+    values = as_vector(name, value, size)
+    if (values <= 0).any():
+        raise MampcError(f"{name}: expected positive numbers, received {values}")
+    return values

@@ -1,0 +1,194 @@
+"""Input-output records: from a plant, from a file, to a file."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mampc.arrays import Array, as_matrix, as_number, as_vector
+from mampc.errors import MampcError
+from mampc.lti import StateSpace
+from mampc.names import Names, require_count
+from mampc.plants import Plant, advance
+
+CSV_FILE_LIMIT = 1 << 30  # bytes
+
+
+@dataclass(frozen=True, eq=False)
+class IOData:
+    """A record of inputs u (N, m) and outputs y (N, l), sampled together every dt seconds.
+
+    y[k] is measured just as u[k] begins to act. Engineering units.
+
+    Args:
+        u, y: the record; one-dimensional arrays mean a single signal.
+        dt: sample time in seconds.
+        names: default u1.., y1...
+
+    Raises:
+        MampcError: different lengths, no samples, or numbers that are not finite.
+    """
+
+    u: Array
+    y: Array
+    dt: float
+    names: Names = None  # type: ignore[assignment]  # always set after construction
+
+    def __post_init__(self) -> None:
+        u, y = (_column(name, getattr(self, name)) for name in ("u", "y"))
+        if len(u) != len(y) or len(u) == 0:
+            raise MampcError(f"IOData: expected as many input as output samples, received {len(u)} and {len(y)}")
+        names = Names.numbered(u.shape[1], y.shape[1]) if self.names is None else self.names
+        names = replace(names, states=())
+        require_count("names.inputs", names.inputs, u.shape[1])
+        require_count("names.outputs", names.outputs, y.shape[1])
+        object.__setattr__(self, "u", u)
+        object.__setattr__(self, "y", y)
+        object.__setattr__(self, "dt", as_number("dt", self.dt, 0.0, exclusive=True))
+        object.__setattr__(self, "names", names)
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def __getitem__(self, rows: slice) -> IOData:
+        """The samples of a slice, as a record."""
+        if not isinstance(rows, slice):
+            raise MampcError(f"IOData: expected a slice of samples, received {rows!r}")
+        return replace(self, u=self.u[rows], y=self.y[rows])
+
+    def split(self, share: float = 2 / 3) -> tuple[IOData, IOData]:
+        """The first `share` of the samples and the rest: to estimate on and to validate on."""
+        cut = round(as_number("share", share, 0.0) * len(self))
+        if not 0 < cut < len(self):
+            raise MampcError(f"split: expected a share that leaves samples on both sides, received {share}")
+        return self[:cut], self[cut:]
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write a header `time,inputs,outputs` and one row per sample, in full precision."""
+        target = Path(path)
+        partial = target.with_name(f".{target.name}.partial")
+        with partial.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time", *self.names.inputs, *self.names.outputs])
+            time = np.arange(len(self))[:, None] * self.dt
+            writer.writerows(np.hstack([time, self.u, self.y]).tolist())
+        partial.replace(target)
+
+    @classmethod
+    def from_csv(
+        cls, path: str | Path, *, inputs: Sequence[str], outputs: Sequence[str], dt: float | None = None
+    ) -> IOData:
+        """Read the named columns of a CSV file with a header row.
+
+        Args:
+            path: the file.
+            inputs, outputs: column names.
+            dt: sample time in seconds; default from a column named `time`.
+
+        Raises:
+            MampcError: a missing column, an empty or ragged file, a field that is not a number, or
+                an uneven `time` column where dt is taken from it.
+        """
+        header, rows = _read_csv(Path(path))
+        inputs, outputs = tuple(inputs), tuple(outputs)
+        columns = {}
+        for name in (*inputs, *outputs, *(["time"] if dt is None else [])):
+            if header.count(name) != 1:
+                hint = "; pass dt (--dt)" if name == "time" else ""
+                raise MampcError(f"{path}: expected one column {name!r}, received columns {header}{hint}")
+            columns[name] = _numbers(Path(path), rows, header.index(name), name)
+        if dt is None:
+            dt = _even_step(path, columns["time"])
+        u = np.stack([columns[name] for name in inputs], axis=1) if inputs else np.empty((len(rows), 0))
+        y = np.stack([columns[name] for name in outputs], axis=1) if outputs else np.empty((len(rows), 0))
+        return cls(u, y, dt, Names(inputs, outputs))
+
+
+def excite(
+    plant: Plant | StateSpace,
+    u: Any,
+    *,
+    dt: float | None = None,
+    noise: Any = 0.0,
+    seed: int = 0,
+    x0: Any = None,
+) -> IOData:
+    """Apply inputs to a plant and record it.
+
+    Args:
+        plant: nonlinear plant, or a discrete model.
+        u: inputs in engineering units, shape (N, m), each held for dt.
+        dt: sample time in seconds (a discrete model has its own).
+        noise: standard deviation of Gaussian measurement noise, scalar or (l,), in output units.
+        seed: of the noise.
+        x0: initial state; default the steady state at the plant's usual inputs, or at the first ones.
+
+    Raises:
+        MampcError: inputs of the wrong width, or a failed integration.
+    """
+    if isinstance(plant, StateSpace):
+        if not plant.is_discrete or dt not in (None, plant.dt):
+            raise MampcError(f"excite: expected a discrete model and its dt, received {plant.dt:g} s and dt={dt}")
+        dt = plant.dt
+    dt = as_number("dt", dt, 0.0, exclusive=True)
+    m, l = len(plant.names.inputs), len(plant.names.outputs)
+    signal = _column("u", u)
+    signal = as_matrix("u", signal, None, m)
+    if isinstance(plant, StateSpace):
+        y = plant.response(signal, x0)
+    else:
+        x = plant.steady_state(getattr(plant, "u_op", signal[0])) if x0 is None else np.array(x0, dtype=float)
+        y = np.empty((len(signal), l))
+        for k, inputs in enumerate(signal):
+            y[k] = plant.output(x, inputs)
+            x = advance(plant, x, inputs, dt)
+    spread = as_vector("noise", noise, l)
+    if (spread < 0).any():
+        raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
+    y = y + spread * np.random.default_rng(seed).standard_normal(y.shape)
+    return IOData(signal, y, dt, plant.names)
+
+
+def _column(name: str, value: Any) -> Array:
+    array = np.asarray(value)
+    return as_matrix(name, array[:, None] if array.ndim == 1 else array)
+
+
+def _read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
+    try:
+        if path.stat().st_size > CSV_FILE_LIMIT:
+            raise MampcError(f"{path}: expected at most {CSV_FILE_LIMIT} bytes, received {path.stat().st_size}")
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = [[field.strip() for field in row] for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise MampcError(f"{path}: expected a readable CSV file, received: {error}") from None
+    if len(lines) < 2:
+        raise MampcError(f"{path}: expected a header and at least one row of numbers, received {len(lines)} rows")
+    for number, row in enumerate(lines[1:], start=2):
+        if len(row) != len(lines[0]):
+            raise MampcError(f"{path}: expected {len(lines[0])} fields in row {number}, received {len(row)}")
+    return lines[0], lines[1:]
+
+
+def _numbers(path: Path, rows: list[list[str]], column: int, name: str) -> Array:
+    values = np.empty(len(rows))
+    for i, row in enumerate(rows):
+        try:
+            values[i] = float(row[column])
+        except ValueError:
+            values[i] = np.nan
+        if not np.isfinite(values[i]):
+            raise MampcError(f"{path}: expected a number in row {i + 2}, column {name!r}, received {row[column]!r}")
+    return values
+
+
+def _even_step(path: str | Path, time: Array) -> float:
+    steps = np.diff(time)
+    if len(steps) == 0 or steps[0] <= 0 or not np.allclose(steps, np.mean(steps), rtol=1e-3):
+        raise MampcError(f"{path}: expected an evenly increasing time column, or a sample time (dt, --dt)")
+    return float(np.mean(steps))

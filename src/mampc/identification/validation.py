@@ -1,0 +1,94 @@
+"""How well a model explains a record it has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mampc.arrays import Array
+from mampc.errors import MampcError
+from mampc.identification.data import IOData
+from mampc.lti import StateSpace
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """A simulated record beside the measured one.
+
+    Attributes:
+        fit: 100 (1 - |y - y_hat| / |y - mean(y)|) in percent, per output, shape (l,).
+        y_hat: simulated outputs, shape (N, l).
+        residuals: y - y_hat, shape (N, l).
+        x0: initial state, fitted to the record, shape (n,).
+        whiteness: p-value per output, shape (l,), of the Ljung-Box test that the residuals are white:
+            small values say that they are not, which is usual for a simulation without a noise model.
+    """
+
+    fit: Array
+    y_hat: Array
+    residuals: Array
+    x0: Array
+    whiteness: Array
+
+
+def validate(model: StateSpace, data: IOData) -> Validation:
+    """Simulate the model over a record, without feedback of its outputs.
+
+    The outputs serve only to fit the initial state by least squares.
+
+    Raises:
+        MampcError: another sample time or number of signals than the model's.
+    """
+    if not np.isclose(model.dt, data.dt, rtol=1e-6):
+        raise MampcError(f"validate: expected a record sampled every {model.dt:g} s, received {data.dt:g} s")
+    if (data.u.shape[1], data.y.shape[1]) != (model.n_inputs, model.n_outputs):
+        raise MampcError(
+            f"validate: expected {model.n_inputs} inputs and {model.n_outputs} outputs, "
+            f"received {data.u.shape[1]} and {data.y.shape[1]}"
+        )
+    x0 = initial_state(model, data)
+    y_hat = model.response(data.u, x0)
+    residuals = data.y - y_hat
+    return Validation(fit(data.y, y_hat), y_hat, residuals, x0, whiteness(residuals))
+
+
+def fit(y: Array, y_hat: Array) -> Array:
+    """100 (1 - |y - y_hat| / |y - mean(y)|) in percent per output; 100 for a constant matched exactly."""
+    error = np.linalg.norm(y - y_hat, axis=0)
+    spread = np.linalg.norm(y - y.mean(axis=0), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent: Array = 100 * (1 - np.where(error == 0, 0.0, error / spread))
+    return percent
+
+
+def initial_state(model: StateSpace, data: IOData) -> Array:
+    """The state at the first sample that fits the outputs best, shape (n,); least squares."""
+    unexplained = data.y - model.response(data.u)
+    normal = np.empty((0, model.n_states + 1))
+    rows, block = model.C, 2048
+    for start in range(0, len(data), block):
+        free = np.empty((len(unexplained[start : start + block]), *model.C.shape))
+        for k in range(len(free)):
+            free[k] = rows
+            rows = rows @ model.A
+        stacked = np.concatenate([free, unexplained[start : start + block, :, None]], axis=2)
+        normal = np.linalg.qr(np.concatenate([normal, stacked.reshape(-1, model.n_states + 1)]), mode="r")
+    x0: Array = np.linalg.lstsq(normal[:, :-1], normal[:, -1], rcond=1e-12)[0]
+    return x0
+
+
+def whiteness(residuals: Array, lags: int = 20) -> Array:
+    """p-values of the Ljung-Box test, one per column; 1 for residuals that are all zero."""
+    from scipy.stats import chi2
+
+    count = len(residuals)
+    lags = max(1, min(lags, count - 2))
+    centred = residuals - residuals.mean(axis=0)
+    power = np.maximum((centred**2).sum(axis=0), 1e-300)
+    statistic = np.zeros(residuals.shape[1])
+    for lag in range(1, lags + 1):
+        correlation = (centred[lag:] * centred[:-lag]).sum(axis=0) / power
+        statistic += correlation**2 / max(1, count - lag)
+    p: Array = chi2.sf(count * (count + 2) * statistic, lags)
+    return p

@@ -1,0 +1,6 @@
+"""Nonlinear plants with documented parameters, and what a plant of your own must have."""
+
+from mampc.plants.plant import Plant, advance
+from mampc.plants.quadruple_tank import QuadrupleTank
+
+__all__ = ["Plant", "QuadrupleTank", "advance"]

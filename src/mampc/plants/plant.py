@@ -1,0 +1,55 @@
+"""What a plant is, and how it moves from one sample to the next."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from mampc.arrays import Array
+from mampc.errors import MampcError
+from mampc.names import Names
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """A nonlinear plant dx/dt = derivative(x, u), y = output(x, u), in engineering units.
+
+    `x` has shape (..., n) and `u` (..., m): the last axis holds the signals. Its dimensions are those of
+    `names`. A plant may have `u_op`, the inputs (m,) of its usual operating point.
+    """
+
+    @property
+    def names(self) -> Names: ...
+
+    def derivative(self, x: Array, u: Array) -> Array: ...
+
+    def output(self, x: Array, u: Array) -> Array: ...
+
+    def steady_state(self, u: Any = None) -> Array: ...
+
+
+def parameter(default: Any, unit: str, source: str) -> Any:
+    """A dataclass field that documents its unit and where its value comes from."""
+    return field(default=default, metadata={"unit": unit, "source": source})
+
+
+def advance(plant: Plant, x: Array, u: Array, dt: float) -> Array:
+    """The state dt seconds later under constant inputs, shape (n,); integrated with LSODA.
+
+    Raises:
+        MampcError: the integration failed.
+    """
+    from scipy.integrate import solve_ivp
+
+    # Tight enough that the simulation error stays far below any measurement noise.
+    result = solve_ivp(
+        lambda _, state: plant.derivative(state, u), (0.0, dt), x, method="LSODA", rtol=1e-8, atol=1e-9
+    )
+    if not result.success or not np.isfinite(result.y[:, -1]).all():
+        raise MampcError(
+            f"{type(plant).__name__}: the integration failed at inputs {u}: {result.message}"
+        )
+    end: Array = result.y[:, -1]
+    return end

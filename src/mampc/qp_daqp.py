@@ -1,0 +1,115 @@
+"""The daqp back end: a dual active-set solver, warm-started, a few microseconds a solve at MPC sizes.
+
+daqp (Arnström, Bemporad, Axehill, IEEE Trans. Automatic Control 67, 2022) is fast and bare. This class
+stands between its sharp edges and the controllers; tests/test_qp_daqp.py has a test for each edge.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+
+from mampc.arrays import Array
+from mampc.errors import MampcError
+from mampc.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram
+
+_STATUS = {
+    1: QPStatus.OPTIMAL,
+    2: QPStatus.OPTIMAL,  # daqp's "soft optimal"; no soft rows are used here
+    -1: QPStatus.INFEASIBLE,
+    -4: QPStatus.ITERATION_LIMIT,
+    -7: QPStatus.TIME_LIMIT,
+}
+_BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
+
+
+class DaqpSolver:
+    """Solves one `QuadraticProgram` again and again for new f and bounds.
+
+    Safe to share between threads (each gets its own daqp workspace) and to pickle (the workspace is
+    rebuilt). A failed solve throws the workspace away, so that it cannot spoil the next one.
+
+    Args:
+        program: the constant part.
+        time_limit: seconds a solve may take, None for no limit.
+        iteration_limit: active-set changes a solve may take.
+
+    Raises:
+        MampcError: daqp refuses the program.
+    """
+
+    def __init__(
+        self, program: QuadraticProgram, *, time_limit: float | None = None, iteration_limit: int = 10_000
+    ) -> None:
+        self.program = program
+        self._settings = {
+            "primal_tol": 1e-9,
+            "iter_limit": iteration_limit,
+            "time_limit": 0.0 if time_limit is None else time_limit,
+        }
+        self._f_shape = (program.n_variables,)
+        self._bound_shape = (program.n_bounds,)
+        self._local = threading.local()
+        self._local.model = self._fresh_model()
+
+    def solve(self, f: Array, lower: Array, upper: Array) -> QPSolution:
+        """Minimise for the linear term f, shape (n,), and bounds, shape (n_simple + rows,).
+
+        Non-finite f, not-a-number bounds and lower > upper give the status BAD_DATA.
+
+        Raises:
+            MampcError: wrong shapes.
+        """
+        if f.shape != self._f_shape or lower.shape != self._bound_shape or upper.shape != self._bound_shape:
+            raise MampcError(
+                f"solve: expected f {self._f_shape} and bounds {self._bound_shape}, "
+                f"received {f.shape}, {lower.shape}, {upper.shape}"
+            )
+        # f @ f is finite only if f is; lower <= upper is false for not-a-number too.
+        if not (f @ f < np.inf and (lower <= upper).all()):
+            return _BAD_DATA
+        model = getattr(self._local, "model", None)
+        if model is None:
+            model = self._local.model = self._fresh_model()
+        # daqp reads memory as contiguous doubles and keeps references to it: hand it copies of its own.
+        flag = model.update(f=_own(f), blower=_own(lower), bupper=_own(upper))
+        if flag < 0:
+            self._local.model = None
+            return _BAD_DATA
+        z, _, flag, info = model.solve()
+        if flag <= 0:
+            self._local.model = None
+            return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
+        return QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
+
+    def _fresh_model(self) -> Any:
+        import daqp
+
+        program = self.program
+        model = daqp.Model()
+        model.settings = self._settings
+        bound = np.full(program.n_bounds, UNBOUNDED)
+        flag, _ = model.setup(
+            np.ascontiguousarray(program.H), np.zeros(program.n_variables), np.ascontiguousarray(program.A),
+            bound, -bound, np.zeros(program.n_bounds, dtype=np.intc),
+        )  # fmt: skip
+        if flag < 0:
+            raise MampcError(f"daqp: expected a strictly convex program, received setup flag {flag}")
+        return model
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"program": self.program, "settings": self._settings}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        settings = state["settings"]
+        self.__init__(  # type: ignore[misc]
+            state["program"],
+            time_limit=settings["time_limit"] or None,
+            iteration_limit=settings["iter_limit"],
+        )
+
+
+def _own(array: Array) -> Array:
+    return np.array(array, dtype=np.float64, order="C")

@@ -1,0 +1,222 @@
+"""The closed loop: a plant, a regulator, a reference; and the run that comes of them."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mampc import metrics
+from mampc.arrays import Array, as_array, as_matrix, as_vector, as_whole
+from mampc.controllers.decision import Decision
+from mampc.errors import MampcError
+from mampc.lti import StateSpace
+from mampc.metrics import Metrics
+from mampc.names import Names
+from mampc.plants import Plant, advance
+from mampc.regulator import Regulator
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A closed-loop run of T samples, in engineering units.
+
+    Attributes:
+        t: time in seconds, shape (T,).
+        u: applied inputs, shape (T, m); u[k] acts from t[k] on.
+        y: true outputs at t[k], shape (T, l), without measurement noise.
+        y_measured: what the regulator saw, shape (T, l).
+        r: reference, shape (T, l).
+        u_initial: inputs before the first sample, shape (m,).
+        decisions: the regulator's decisions, with their states left out.
+        dt: sample time in seconds.
+        names: of the inputs and outputs.
+    """
+
+    t: Array
+    u: Array
+    y: Array
+    y_measured: Array
+    r: Array
+    u_initial: Array
+    decisions: tuple[Decision, ...] = field(repr=False)
+    dt: float
+    names: Names
+
+    def metrics(self, *, threshold: float = 0.1, skip: int = 0) -> Metrics:
+        """How often the inputs move and how well the outputs follow; see `Metrics`."""
+        return metrics.compute(
+            self.u, self.y, self.r, self.u_initial, self.dt, threshold=threshold, skip=skip
+        )
+
+    @property
+    def solve_times(self) -> Array:
+        """Seconds per step, shape (T,)."""
+        return np.array([decision.solve_time for decision in self.decisions])
+
+    @property
+    def statuses(self) -> dict[str, int]:
+        """How often each status came."""
+        return dict(Counter(decision.status.value for decision in self.decisions))
+
+    def plot(self) -> Figure:
+        """Inputs as staircases above outputs with their references; needs mampc[plot]."""
+        from mampc.report.figures import run_figure
+
+        return run_figure(self)
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write time, inputs, outputs, measured outputs, references and status, in full precision."""
+        inputs, outputs = self.names.inputs, self.names.outputs
+        header = [
+            "time", *inputs, *outputs, *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
+            "status", "objective", "iterations", "solve_time_us",
+        ]  # fmt: skip
+        numbers = np.hstack([self.t[:, None], self.u, self.y, self.y_measured, self.r]).tolist()
+        target = Path(path)
+        unfinished = target.with_name(f".{target.name}.partial")
+        with unfinished.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            for row, d in zip(numbers, self.decisions, strict=True):
+                writer.writerow([*row, d.status.value, d.objective, d.iterations, round(d.solve_time * 1e6, 2)])
+        unfinished.replace(target)
+
+
+def simulate(
+    plant: Plant | StateSpace,
+    regulator: Regulator,
+    reference: Any,
+    *,
+    steps: int | None = None,
+    noise: Any = 0.0,
+    seed: int = 0,
+    preview: bool = False,
+    input_disturbance: Any = None,
+    output_disturbance: Any = None,
+    u_initial: Any = None,
+    progress: bool | None = None,
+) -> Run:
+    """Run a regulator on a plant that starts at rest.
+
+    Args:
+        plant: a nonlinear plant, or a discrete `StateSpace` standing in for one.
+        regulator: output feedback; its model's sample time is that of the loop.
+        reference: absolute outputs to track: constant (l,), or one row per sample (T, l).
+        steps: T; default the rows of the reference.
+        noise: standard deviation of Gaussian measurement noise, scalar or (l,), in output units.
+        seed: of the noise; equal seeds give equal noise whatever the regulator.
+        preview: let the regulator see the reference over its prediction horizon.
+        input_disturbance: unmeasured, added to the inputs on their way to the plant, (m,) or (T, m).
+        output_disturbance: unmeasured, added to the true outputs, (l,) or (T, l).
+        u_initial: inputs at the start, shape (m,); default the plant's usual ones (its `u_op`).
+        progress: show a progress bar on the terminal; default: when the run is long.
+
+    Raises:
+        MampcError: arguments that do not fit together, or a plant that cannot be integrated.
+    """
+    model = regulator.controller.problem.model
+    m, l = model.n_inputs, model.n_outputs
+    names = plant.names
+    if (len(names.inputs), len(names.outputs)) != (m, l):
+        raise MampcError(
+            f"simulate: expected a plant with {m} inputs and {l} outputs, "
+            f"received {len(names.inputs)} and {len(names.outputs)}"
+        )
+    r = _trajectory("reference", reference, l, steps)
+    T = len(r)
+    spread = as_vector("noise", noise, l)
+    if (spread < 0).any():
+        raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
+    wobble = spread * np.random.default_rng(seed).standard_normal((T, l))
+    at_inputs = _trajectory("input_disturbance", 0.0 if input_disturbance is None else input_disturbance, m, T)
+    at_outputs = _trajectory("output_disturbance", 0.0 if output_disturbance is None else output_disturbance, l, T)
+    usual = getattr(plant, "u_op", None)
+    if u_initial is None:
+        u_initial = model.u_op if usual is None else usual
+    u = as_vector("u_initial", u_initial, m)
+
+    x = plant.steady_state(u)
+    output, move = _sampled(plant, model.dt)
+    state = regulator.initial_state(u, output(x, u))
+    horizon = regulator.controller.problem.prediction_horizon
+    inputs, outputs, decisions = np.empty((T, m)), np.empty((T, l)), []
+    start = u
+    for k in _watched(T, progress):
+        outputs[k] = output(x, u + at_inputs[k]) + at_outputs[k]
+        ahead = r[np.minimum(np.arange(k, k + horizon + 1), T - 1)] if preview else r[k]
+        decision = regulator.step(state, outputs[k] + wobble[k], ahead)
+        state, u = decision.state, decision.u
+        inputs[k] = u
+        decisions.append(_without_state(decision))
+        x = move(x, u + at_inputs[k])
+    return Run(
+        t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + wobble, r=r, u_initial=start,
+        decisions=tuple(decisions), dt=model.dt, names=names,
+    )  # fmt: skip
+
+
+def _sampled(plant: Plant | StateSpace, dt: float) -> tuple[Any, Any]:
+    """The plant's output and its motion over one sample."""
+    if not isinstance(plant, StateSpace):
+        return plant.output, lambda x, u: advance(plant, x, u, dt)
+    if not np.isclose(plant.dt, dt, rtol=1e-6):
+        raise MampcError(f"simulate: expected a plant sampled every {dt:g} s, received {plant.dt:g} s")
+    A, B, C, D, u_op, y_op = plant.A, plant.B, plant.C, plant.D, plant.u_op, plant.y_op
+    return lambda x, u: y_op + C @ x + D @ (u - u_op), lambda x, u: A @ x + B @ (u - u_op)
+
+
+def _trajectory(name: str, value: Any, width: int, steps: int | None) -> Array:
+    """One row per sample, from a constant or from rows of which the last is repeated."""
+    array = as_array(name, value)
+    if array.ndim < 2:
+        if steps is None:
+            raise MampcError(f"steps: expected a number of samples, since {name} is constant")
+        return np.tile(as_vector(name, array, width), (as_whole("steps", steps, 1), 1))
+    rows = as_matrix(name, array, None, width)
+    steps = len(rows) if steps is None else as_whole("steps", steps, 1)
+    if len(rows) == 0:
+        raise MampcError(f"{name}: expected at least one row, received none")
+    return rows[np.minimum(np.arange(steps), len(rows) - 1)]
+
+
+def _without_state(decision: Decision) -> Decision:
+    from dataclasses import replace
+
+    return replace(decision, state=None)
+
+
+def _watched(steps: int, progress: bool | None) -> Any:
+    """0..steps-1, with a progress bar that shows itself once the run has taken two seconds."""
+    if progress is False:
+        return range(steps)
+    return _with_bar(steps, 0.0 if progress else 2.0)
+
+
+def _with_bar(steps: int, patience: float) -> Any:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    began, bar, task = time.perf_counter(), None, partial(int)
+    try:
+        for k in range(steps):
+            if bar is None and console.is_terminal and time.perf_counter() - began >= patience:
+                bar = Progress(console=console, transient=True)
+                bar.start()
+                task = partial(bar.update, bar.add_task("closed loop", total=steps, completed=k))
+            yield k
+            if bar is not None:
+                task(completed=k + 1)
+    finally:
+        if bar is not None:
+            bar.stop()
