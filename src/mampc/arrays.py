@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from mampc.errors import MampcError
 
-Array: TypeAlias = npt.NDArray[np.float64]
+Array: TypeAlias = npt.NDArray[np.floating[Any]]  # float64 throughout
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 

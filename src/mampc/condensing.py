@@ -23,8 +23,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.arrays import Array, BoolArray, ComplexArray
+from mampc.errors import MampcError
 from mampc.problem import TrackingProblem
 from mampc.qp import UNBOUNDED, QuadraticProgram
+
+LARGEST_RESPONSE = 1e100  # per unit of state or input; its square is still a number
 
 
 class Parts(NamedTuple):
@@ -114,7 +117,8 @@ class CondensedQP:
         cumulate: u_j - u_prev per move, shape (n_moves, n_moves).
 
     Raises:
-        MampcError: the moves are not all determined by the weights (H is singular).
+        MampcError: the moves are not all determined by the weights (H is singular), or an unstable
+            model's predictions overflow.
     """
 
     def __init__(self, problem: TrackingProblem) -> None:
@@ -125,9 +129,15 @@ class CondensedQP:
         self.cumulate = np.kron(np.tri(n_c), np.eye(m))
 
         observed = [model.C]  # C A^i
-        for _ in range(n_p):
-            observed.append(observed[-1] @ model.A)
-        step = np.cumsum([model.D] + [rows @ model.B for rows in observed[:-1]], axis=0)  # S_i
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(n_p):
+                observed.append(observed[-1] @ model.A)
+            step = np.cumsum([model.D] + [rows @ model.B for rows in observed[:-1]], axis=0)  # S_i
+        if not (np.abs(observed) < LARGEST_RESPONSE).all() or not (np.abs(step) < LARGEST_RESPONSE).all():
+            raise MampcError(
+                f"CondensedQP: expected predictions that stay within numbers over {n_p} samples, received a "
+                "model that grows without bound; shorten the prediction horizon"
+            )
         self.theta = np.zeros(((n_p + 1) * l, self.n_moves))
         for j in range(n_c):
             self.theta[j * l :, j * m : (j + 1) * m] = step[: n_p + 1 - j].reshape(-1, m)
@@ -201,7 +211,9 @@ class CondensedQP:
                 [violation[self._below % l], self.theta[self._below]],
             ]
         )
-        H = np.block([[problem.output_limit_weight * np.eye(v), np.zeros((v, n))], [np.zeros((n, v)), self.H]])
+        H = np.block(
+            [[problem.output_limit_weight * np.eye(v), np.zeros((v, n))], [np.zeros((n, v)), self.H]]
+        )
         self.program = QuadraticProgram(H, A, n_simple)
         self.bounded_rows = np.vstack([np.eye(n_simple - v, n), A[:, v:]])
         self._move_of_bound = np.full(n_simple + len(A), -1)  # the move that makes an input row new, else -1
@@ -232,7 +244,9 @@ class CondensedQP:
     def _with_constant_reference(self, preview_map: Array) -> Array:
         """The map for one reference (l,) that holds over the horizon."""
         reference = self._one_at + 1
-        constant = preview_map[:, reference:].reshape(len(preview_map), -1, self.problem.model.n_outputs).sum(axis=1)
+        constant = (
+            preview_map[:, reference:].reshape(len(preview_map), -1, self.problem.model.n_outputs).sum(axis=1)
+        )
         return np.hstack([preview_map[:, :reference], constant])
 
     def instance(

@@ -88,7 +88,9 @@ class KalmanFilter:
         try:
             P = solve_discrete_are(A.T, C.T, Q, R)
         except (np.linalg.LinAlgError, ValueError) as error:
-            raise MampcError(f"offset_free: expected a detectable model, the Riccati equation failed: {error}") from None
+            raise MampcError(
+                f"offset_free: expected a detectable model, the Riccati equation failed: {error}"
+            ) from None
         gain = np.linalg.solve(C @ P @ C.T + R, C @ P).T
         return cls(model, disturbance, gain)
 
@@ -109,7 +111,9 @@ class KalmanFilter:
 
     def correct(self, predicted: Estimate, u: Array, y: Array) -> Estimate:
         """Correct with measurements y (l,), taken just before the inputs u (m,) are replaced."""
-        innovation = y - self._output(predicted.x, u + predicted.input_disturbance, predicted.output_disturbance)
+        innovation = y - self._output(
+            predicted.x, u + predicted.input_disturbance, predicted.output_disturbance
+        )
         correction = self.gain @ innovation
         n = self.model.n_states
         x = predicted.x + correction[:n]
@@ -149,7 +153,7 @@ def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
 
 
 def _gain_size(model: StateSpace) -> float:
-    """A typical output change per unit of input: root mean square of the dc gain, or of 100 samples' response."""
+    """A typical output change per unit of input: root mean square gain at rest, or after 100 samples."""
     try:
         gain = model.dc_gain()
     except MampcError:

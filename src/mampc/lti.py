@@ -74,15 +74,15 @@ class StateSpace:
 
     @property
     def n_states(self) -> int:
-        return self.A.shape[0]
+        return len(self.A)
 
     @property
     def n_inputs(self) -> int:
-        return self.B.shape[1]
+        return int(self.B.shape[1])
 
     @property
     def n_outputs(self) -> int:
-        return self.C.shape[0]
+        return len(self.C)
 
     @property
     def is_discrete(self) -> bool:
@@ -105,8 +105,10 @@ class StateSpace:
         """
         shift = np.eye(self.n_states) if self.is_discrete else 0.0
         singular = shift - self.A
-        if np.linalg.cond(singular) > 1e13:
-            raise MampcError("dc_gain: expected a model without integrators, received a pole at zero frequency")
+        if self.n_states and np.linalg.cond(singular) > 1e13:
+            raise MampcError(
+                "dc_gain: expected a model without integrators, received a pole at zero frequency"
+            )
         gain: Array = self.C @ np.linalg.solve(singular, self.B) + self.D
         return gain
 
@@ -205,7 +207,9 @@ class StateSpace:
             return model.discretise(dt)
         if np.isclose(model.dt, dt, rtol=1e-9):
             return model
-        raise MampcError(f"from_any: expected a sample time of {dt:g} s, received a system with {model.dt:g} s")
+        raise MampcError(
+            f"from_any: expected a sample time of {dt:g} s, received a system with {model.dt:g} s"
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the model as JSON, whole or not at all; `load` gives the same numbers back."""
@@ -228,14 +232,16 @@ class StateSpace:
             if size > MODEL_FILE_LIMIT:
                 raise MampcError(f"{path}: expected at most {MODEL_FILE_LIMIT} bytes, received {size}")
             content = json.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        except MampcError:
+            raise
+        except (OSError, ValueError, RecursionError) as error:
             raise MampcError(f"{path}: expected a mampc model file, received: {error}") from None
         if not isinstance(content, dict) or content.get("format") != "mampc-model-1":
             raise MampcError(f"{path}: expected a model file with format 'mampc-model-1'")
         try:
             names = Names(**{k: tuple(v) for k, v in content["names"].items()})
-            matrices = [content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")]
-            return cls(*matrices, names)
+            matrices = {k: content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")}
+            return cls(**matrices, names=names)
         except (KeyError, TypeError, AttributeError) as error:
             raise MampcError(f"{path}: expected A, B, C, D, dt, u_op, y_op, names; {error!r}") from None
         except MampcError as error:
@@ -278,28 +284,33 @@ def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
         dt=0.0,
         u_op=u_op,
         y_op=plant.output(x_op, u_op),
-        names=getattr(plant, "names", None),
+        names=getattr(plant, "names", None),  # type: ignore[arg-type]
     )
 
 
 def _matrices(system: Any) -> tuple[Any, Any, Any, Any, float | None]:
     """A, B, C, D and the sample time: 0 for continuous, None where the system leaves it open."""
     origin = type(system).__module__.split(".")[0]
-    if origin == "control":
-        if not hasattr(system, "A"):
-            import control
+    try:
+        if origin == "control":
+            if not hasattr(system, "A"):
+                import control
 
-            system = control.ss(system)
-        dt = system.dt
-        return system.A, system.B, system.C, system.D, None if dt is None or dt is True else float(dt)
-    if origin == "scipy" and hasattr(system, "to_ss"):
-        model = system.to_ss()
-        dt = model.dt
-        return model.A, model.B, model.C, model.D, 0.0 if dt is None else None if dt is True else float(dt)
-    if isinstance(system, (tuple, list)) and len(system) in (4, 5):
-        dt = system[4] if len(system) == 5 else None
-        return *system[:4], None if dt is True else float(dt or 0.0)  # type: ignore[return-value]
+                system = control.ss(system)
+            return system.A, system.B, system.C, system.D, _stated(system.dt)
+        if origin == "scipy" and hasattr(system, "to_ss"):
+            model = system.to_ss()
+            return model.A, model.B, model.C, model.D, 0.0 if model.dt is None else _stated(model.dt)
+        if isinstance(system, (tuple, list)) and len(system) in (4, 5):
+            return *system[:4], _stated(system[4] or 0.0) if len(system) == 5 else 0.0
+    except (TypeError, ValueError, NotImplementedError) as error:  # improper, or beyond the library
+        raise MampcError(f"from_any: expected a system with a state-space form, received: {error}") from None
     raise MampcError(
         "from_any: expected a python-control or scipy.signal system or (A, B, C, D[, dt]), "
         f"received {type(system).__name__}"
     )
+
+
+def _stated(dt: Any) -> float | None:
+    """A sample time, or None where a library's None or True leaves it open."""
+    return None if dt is None or dt is True else float(dt)

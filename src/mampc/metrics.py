@@ -75,7 +75,9 @@ def compute(
         tracking_error=float(np.mean(np.sum((y[skip:] - r[skip:]) ** 2, axis=1))),
         moves=moves,
         travel=np.where(moved, size, 0.0).sum(axis=0),
-        reversals=np.array([_reversals(column[kept]) for column, kept in zip(changes.T, moved.T, strict=True)]),
+        reversals=np.array(
+            [_reversals(column[kept]) for column, kept in zip(changes.T, moved.T, strict=True)]
+        ),
         mean_hold_time=steps * dt / (moves + 1),
     )
 

@@ -81,7 +81,7 @@ class TrackingProblem:
     move_weight: Any = field(default=0.1, kw_only=True)
     limits: Limits = field(default=Limits(), kw_only=True)
     weigh_first_move: bool = field(default=True, kw_only=True)
-    output_limit_weight: float | None = field(default=None, kw_only=True)
+    output_limit_weight: float = field(default=None, kw_only=True)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, StateSpace):

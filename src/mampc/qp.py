@@ -19,6 +19,12 @@ from mampc.arrays import Array
 from mampc.errors import MampcError
 
 UNBOUNDED = 1e30  # what stands for infinity in bounds
+LARGEST = 1e150  # sizes whose products are still numbers
+
+
+def is_usable(vector: Array) -> bool:
+    """Whether all entries, one at least, are numbers of a size to calculate with; never warns."""
+    return bool(-LARGEST < vector[vector.argmin()] and vector[vector.argmax()] < LARGEST)
 
 
 class QPStatus(Enum):
@@ -49,7 +55,7 @@ class QuadraticProgram:
     """The part of a quadratic program that stays: H (n, n) positive definite, A (rows, n), n_simple.
 
     Raises:
-        MampcError: shapes that do not fit, or H not positive definite.
+        MampcError: shapes that do not fit, numbers that are not finite, or H not positive definite.
     """
 
     H: Array
@@ -63,20 +69,22 @@ class QuadraticProgram:
                 f"QuadraticProgram: expected H (n, n), A (rows, n), 0 <= n_simple <= n, "
                 f"received {self.H.shape}, {self.A.shape}, {self.n_simple}"
             )
+        if not (np.isfinite(self.H).all() and np.isfinite(self.A).all()):
+            raise MampcError("QuadraticProgram: expected finite numbers in H and A, received others")
         eigenvalues = np.linalg.eigvalsh(self.H) if n else np.ones(1)
         if not eigenvalues[0] > 1e-13 * eigenvalues[-1]:
             raise MampcError(
                 "QuadraticProgram: expected a positive definite Hessian, received smallest and largest "
-                f"eigenvalues {eigenvalues[0]:.3g} and {eigenvalues[-1]:.3g}; give every move a positive weight"
+                f"eigenvalues {eigenvalues[0]:.3g} and {eigenvalues[-1]:.3g}; give every move a weight"
             )
 
     @property
     def n_variables(self) -> int:
-        return self.H.shape[0]
+        return len(self.H)
 
     @property
     def n_bounds(self) -> int:
-        return self.n_simple + self.A.shape[0]
+        return self.n_simple + len(self.A)
 
     def rows(self, z: Array) -> Array:
         """The bounded quantities [z[:n_simple]; A z]."""
@@ -103,7 +111,8 @@ class QuadraticProgram:
             return np.inf
         rows, pull = self.rows(solution.z), solution.multipliers
         distance = np.where(pull > 0, upper - rows, rows - lower)
-        return float(np.sum(np.where(pull == 0, 0.0, np.abs(pull * distance))))
+        active = pull != 0  # a bound without pull may be infinite
+        return float(np.sum(np.abs(pull[active] * distance[active])))
 
 
 class QPSolver(Protocol):

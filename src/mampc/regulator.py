@@ -13,6 +13,7 @@ from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.errors import MampcError
 from mampc.estimation import Estimate, KalmanFilter
+from mampc.qp import is_usable
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,11 @@ class Regulator:
         self._y_shape = (model.n_outputs,)
         self.estimator = KalmanFilter.offset_free(model) if estimator is None else estimator
         received = self.estimator.model
-        if (received.n_states, received.n_inputs, received.n_outputs) != (model.n_states, model.n_inputs, model.n_outputs):
+        if (received.n_states, received.n_inputs, received.n_outputs) != (
+            model.n_states,
+            model.n_inputs,
+            model.n_outputs,
+        ):
             raise MampcError(
                 f"estimator: expected {model.n_states} states, {model.n_inputs} inputs, {model.n_outputs} "
                 f"outputs, received {received.n_states}, {received.n_inputs}, {received.n_outputs}"
@@ -78,7 +83,7 @@ class Regulator:
             memory = self._applied(memory, u_applied)
         u_previous = memory.inputs[-1]
         estimate = self.estimator.predict(state.estimate, u_previous)
-        usable = bool(y @ y < np.inf)
+        usable = is_usable(y)
         if usable:
             estimate = self.estimator.correct(estimate, u_previous, y)
         decision = self.controller.step(

@@ -23,7 +23,8 @@ def prbs(
 ) -> Array:
     """Pseudo-random binary sequences, one per input, each from its own start state.
 
-    A maximum-length sequence repeats after 2^order - 1 bits; its bits are balanced to one.
+    A maximum-length sequence repeats after 2^order - 1 bits; its bits are balanced to one. The start
+    states lie evenly along one period: inputs that are short shifts of each other could not be told apart.
 
     Args:
         order: length of the shift register, 2 to 20.
@@ -32,7 +33,7 @@ def prbs(
         mean: middle of the two levels, scalar or one per input, in input units.
         inputs: number of inputs; default as many as `amplitude` or `mean` have entries, or 1.
         samples: length of the signal; default one full period, (2^order - 1) * hold.
-        seed: chooses the start states.
+        seed: chooses the first start state.
 
     Returns:
         Inputs in engineering units, shape (samples, inputs).
@@ -51,12 +52,11 @@ def prbs(
     period = 2**order - 1
     samples = period * hold if samples is None else as_whole("samples", samples, 1)
     levels, middle = as_vector("amplitude", amplitude, inputs), as_vector("mean", mean, inputs)
-    starts = np.random.default_rng(seed).choice(np.arange(1, period + 1), size=inputs, replace=False)
+    first = np.random.default_rng(as_whole("seed", seed, 0)).integers(period)
+    bits = max_len_seq(order)[0].astype(np.float64)  # int8 would overflow when scaled
     signal = np.empty((samples, inputs))
-    for i, start in enumerate(starts):
-        state = (int(start) >> np.arange(order)) & 1
-        bits, _ = max_len_seq(order, state=state.astype(np.int8))
-        held = np.repeat(bits.astype(np.float64), hold)  # int8 would overflow when scaled
+    for i in range(inputs):
+        held = np.repeat(np.roll(bits, -(first + i * period // inputs)), hold)
         signal[:, i] = middle[i] + levels[i] * (2 * np.resize(held, samples) - 1)
     return signal
 
@@ -77,9 +77,13 @@ def steps(samples: int, initial: Any, changes: Sequence[tuple[int, Any]]) -> Arr
     """
     start = np.atleast_1d(as_array("initial", initial))
     signal = np.tile(start, (as_whole("samples", samples, 1), 1))
-    for at, value in sorted(changes, key=lambda change: change[0]):
+    try:
+        pairs = [(as_whole("changes", at, 0), value) for at, value in changes]
+    except TypeError:
+        raise MampcError(f"changes: expected pairs (sample, values), received {changes!r}") from None
+    for at, value in sorted(pairs, key=lambda change: change[0]):
         values = as_array("changes", value)
         if values.shape not in ((), start.shape):
             raise MampcError(f"changes: expected {start.size} values at {at}, received shape {values.shape}")
-        signal[as_whole("changes", at, 0) :] = values
+        signal[at:] = values
     return signal

@@ -6,7 +6,6 @@ import csv
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,15 +69,16 @@ class Run:
 
     def plot(self) -> Figure:
         """Inputs as staircases above outputs with their references; needs mampc[plot]."""
-        from mampc.report.figures import run_figure
+        from mampc.drawing import closed_loop_figure
 
-        return run_figure(self)
+        return closed_loop_figure(self.t, self.u, self.y, self.r, self.names)
 
     def to_csv(self, path: str | Path) -> None:
         """Write time, inputs, outputs, measured outputs, references and status, in full precision."""
         inputs, outputs = self.names.inputs, self.names.outputs
         header = [
-            "time", *inputs, *outputs, *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
+            "time", *inputs, *outputs,
+            *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
             "status", "objective", "iterations", "solve_time_us",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.y, self.y_measured, self.r]).tolist()
@@ -88,7 +88,9 @@ class Run:
             writer = csv.writer(file)
             writer.writerow(header)
             for row, d in zip(numbers, self.decisions, strict=True):
-                writer.writerow([*row, d.status.value, d.objective, d.iterations, round(d.solve_time * 1e6, 2)])
+                writer.writerow(
+                    [*row, d.status.value, d.objective, d.iterations, round(d.solve_time * 1e6, 2)]
+                )
         unfinished.replace(target)
 
 
@@ -138,8 +140,12 @@ def simulate(
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
     wobble = spread * np.random.default_rng(seed).standard_normal((T, l))
-    at_inputs = _trajectory("input_disturbance", 0.0 if input_disturbance is None else input_disturbance, m, T)
-    at_outputs = _trajectory("output_disturbance", 0.0 if output_disturbance is None else output_disturbance, l, T)
+    at_inputs = _trajectory(
+        "input_disturbance", 0.0 if input_disturbance is None else input_disturbance, m, T
+    )
+    at_outputs = _trajectory(
+        "output_disturbance", 0.0 if output_disturbance is None else output_disturbance, l, T
+    )
     usual = getattr(plant, "u_op", None)
     if u_initial is None:
         u_initial = model.u_op if usual is None else usual
@@ -207,16 +213,16 @@ def _with_bar(steps: int, patience: float) -> Any:
     from rich.progress import Progress
 
     console = Console(stderr=True)
-    began, bar, task = time.perf_counter(), None, partial(int)
+    began, bar, task = time.perf_counter(), None, None
     try:
         for k in range(steps):
             if bar is None and console.is_terminal and time.perf_counter() - began >= patience:
                 bar = Progress(console=console, transient=True)
                 bar.start()
-                task = partial(bar.update, bar.add_task("closed loop", total=steps, completed=k))
+                task = bar.add_task("closed loop", total=steps, completed=k)
             yield k
-            if bar is not None:
-                task(completed=k + 1)
+            if bar is not None and task is not None:
+                bar.update(task, completed=k + 1)
     finally:
         if bar is not None:
             bar.stop()

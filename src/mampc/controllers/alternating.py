@@ -14,6 +14,7 @@ lambda + mu off it: moves off the pattern shrink and never vanish. `polish` make
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +25,10 @@ from mampc.controllers.decision import ControllerState, Status
 from mampc.controllers.pattern_solver import PatternSolver
 from mampc.errors import MampcError
 from mampc.patterns import MoveRules
-from mampc.qp import QuadraticProgram
+from mampc.qp import QPStatus, QuadraticProgram, is_usable
 from mampc.qp_daqp import DaqpSolver
+
+HIGHEST_PENALTY = 1e10  # a growing mu stops here: beyond it the first step loses its digits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,36 +82,43 @@ class AlternatingSearch:
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """Algorithm 1 for one sample, from the guess that the last sample left (at first: v = 0)."""
-        if not instance.f @ instance.f < np.inf:
+        if not is_usable(instance.f):
             return Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
         settings, growth = self.settings, self.settings.penalty_growth
         threshold = self._threshold
-        threshold.set_past(self.rules.past_changes(state.inputs))
-        v = np.zeros(self.condensed.n_moves) if state.guess is None else state.guess.ravel()
+        magnitude = threshold.magnitude(self.rules.past_changes(state.inputs))
+        v: Array = np.zeros(self.condensed.n_moves) if state.guess is None else state.guess.ravel()
         first_step = self._first_step(settings.penalty)
-        first_step.begin(instance)
+        sample = first_step.begin(instance)
         u_last, settled, rounds = None, False, 0
         while rounds < settings.max_iterations:
-            d, u = first_step.minimise(v)
-            if d is None:
-                return Plan(None, HELD_BY[first_step.status], rounds)
-            pattern = threshold.pattern(d)
+            d, u, solved = first_step.minimise(sample, v)
+            if solved is not QPStatus.OPTIMAL:
+                return Plan(None, HELD_BY[solved], rounds)
+            pattern = threshold.pattern(magnitude, d)
             v = d * pattern
             rounds += 1
             if u_last is not None and np.abs(u - u_last).sum() <= settings.tolerance:
-                if growth == 1.0 or np.abs(d - v).max() <= settings.tolerance or first_step.mu > 1e10:
+                if (
+                    growth == 1.0
+                    or np.abs(d - v).max() <= settings.tolerance
+                    or first_step.mu > HIGHEST_PENALTY
+                ):
                     settled = True
                     break
                 first_step = self._first_step(first_step.mu * growth)
-                first_step.begin(instance)
+                sample = first_step.begin(instance)
             u_last = u
         m = len(instance.u_previous)
         guess = np.concatenate([v[m:], np.zeros(m)]).reshape(-1, m)
         if settings.polish:
-            d = self._polished(instance, state, d, pattern)
-            if d is None:
+            polished = self._polished(instance, state, d, pattern)
+            if polished is None:
                 return Plan(None, Status.HELD_SOLVER_FAILED, rounds)
-        status = Status.ITERATION_LIMIT if not settled else Status.FEASIBLE if settings.polish else Status.SETTLED
+            d = polished
+        status = (
+            Status.ITERATION_LIMIT if not settled else Status.FEASIBLE if settings.polish else Status.SETTLED
+        )
         return Plan(d, status, rounds, guess=guess)
 
     def _polished(
@@ -127,6 +137,17 @@ class AlternatingSearch:
         if step is None:
             step = self._first_steps[mu] = FirstStep(self.condensed, mu)
         return step
+
+
+class Sample(NamedTuple):
+    """One sample's data for the first step: its minimiser at v = 0 without limits, f, all bounds."""
+
+    start: Array
+    f: Array
+    lower: Array
+    upper: Array
+    lower_rows: Array
+    upper_rows: Array
 
 
 class FirstStep:
@@ -148,30 +169,30 @@ class FirstStep:
         # One product gives the changes of u and every bounded quantity.
         self._rows = np.vstack([condensed.cumulate, condensed.bounded_rows])
 
-    def begin(self, instance: Instance) -> None:
-        """Take one sample's data."""
+    def begin(self, instance: Instance) -> Sample:
+        """What the rounds of one sample share."""
         v = self._violations
-        self._instance = instance
-        self._start = -(self._inverse @ instance.f_moves)
-        self._lower, self._upper = instance.lower[v:], instance.upper[v:]
+        start = -(self._inverse @ instance.f_moves)
+        return Sample(
+            start, instance.f, instance.lower, instance.upper, instance.lower[v:], instance.upper[v:]
+        )
 
-    def minimise(self, v: Array) -> tuple[Array | None, Array]:
-        """The moves d and the changes u - u_previous they add up to, each (n_moves,); d None on failure."""
-        d = self._start + self._from_v @ v
+    def minimise(self, sample: Sample, v: Array) -> tuple[Array, Array, QPStatus]:
+        """The moves d and the changes u - u_previous they add up to, each (n_moves,), if OPTIMAL."""
+        start, f, lower, upper, lower_rows, upper_rows = sample
+        d: Array = start + self._from_v @ v
         rows = self._rows @ d
         n = len(d)
         bounded = rows[n:]
-        if (bounded >= self._lower).all() and (bounded <= self._upper).all():
-            return d, rows[:n]
-        instance, skipped = self._instance, self._violations
-        f = instance.f.copy()
-        f[skipped:] -= 2 * self.mu * v
-        solution = self._solver.solve(f, instance.lower, instance.upper)
-        self.status = solution.status
+        if (bounded >= lower_rows).all() and (bounded <= upper_rows).all():
+            return d, rows[:n], QPStatus.OPTIMAL
+        f = f.copy()
+        f[self._violations :] -= 2 * self.mu * v
+        solution = self._solver.solve(f, lower, upper)
         if solution.z is None:
-            return None, rows[:n]
-        d = solution.z[skipped:]
-        return d, self._cumulate @ d
+            return d, d, solution.status
+        d = solution.z[self._violations :]
+        return d, self._cumulate @ d, QPStatus.OPTIMAL
 
 
 class HardThreshold:
@@ -185,15 +206,17 @@ class HardThreshold:
         self._s, self._size = s, (past + future) * n_inputs
         place = np.arange(self._size).reshape(n_inputs, past + future).T  # (time, input) -> Psi
         self._past, self._future = place[:past].ravel(), place[past:].ravel()
-        self._magnitude = np.zeros(self._size)
 
-    def set_past(self, changes: Array) -> None:
-        """The applied moves in the window, shape (ns - 1, m)."""
-        self._magnitude[self._past] = -np.abs(changes).ravel()
+    def magnitude(self, past_changes: Array) -> Array:
+        """Minus the size of every move, the applied ones (ns - 1, m) filled in, shape (all moves,)."""
+        magnitude = np.zeros(self._size)
+        magnitude[self._past] = -np.abs(past_changes).ravel()
+        return magnitude
 
-    def pattern(self, d: Array) -> BoolArray:
-        """Which future moves are among the s largest, shape (n_moves,)."""
-        self._magnitude[self._future] = -np.abs(d)
+    def pattern(self, magnitude: Array, d: Array) -> BoolArray:
+        """Which future moves are among the s largest, shape (n_moves,); fills d into `magnitude`."""
+        magnitude[self._future] = -np.abs(d)
         chosen = np.zeros(self._size, dtype=bool)
-        chosen[self._magnitude.argsort(kind="stable")[: self._s]] = True
-        return chosen[self._future]
+        chosen[magnitude.argsort(kind="stable")[: self._s]] = True
+        pattern: BoolArray = chosen[self._future]
+        return pattern

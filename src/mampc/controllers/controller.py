@@ -13,7 +13,7 @@ from mampc.condensing import CondensedQP, Instance
 from mampc.controllers.decision import ControllerState, Decision, Status
 from mampc.errors import MampcError
 from mampc.problem import TrackingProblem
-from mampc.qp import QPStatus
+from mampc.qp import QPStatus, is_usable
 from mampc.qp_daqp import DaqpSolver
 
 HELD_BY = {
@@ -115,8 +115,12 @@ class Controller(ABC):
         if x.shape != self._x_shape:
             raise MampcError(f"x: expected shape {self._x_shape}, received {x.shape}")
         if reference.shape not in self._reference_shapes:
-            raise MampcError(f"reference: expected shape {self._reference_shapes}, received {reference.shape}")
-        instance = self.condensed.instance(x, state.inputs[-1], reference, output_disturbance, input_disturbance)
+            raise MampcError(
+                f"reference: expected shape {self._reference_shapes}, received {reference.shape}"
+            )
+        instance = self.condensed.instance(
+            x, state.inputs[-1], reference, output_disturbance, input_disturbance
+        )
         return self._decide(self._plan(instance, state), instance, state, start)
 
     @abstractmethod
@@ -160,7 +164,7 @@ class Controller(ABC):
                 instance.unlimited_inputs, instance.unlimited_cost,
             )  # fmt: skip
         f = instance.f
-        if not f @ f < np.inf:
+        if not is_usable(f):
             return Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
         solution = self._solver.solve(f, instance.lower, instance.upper)
         if solution.z is None:

@@ -81,14 +81,15 @@ class Decision:
 
     @property
     def gap(self) -> float:
-        """objective - lower_bound, in units of cost: 0 when proven optimal, infinite when nothing is proven."""
+        """objective - lower_bound, in units of cost: 0 when proven optimal, infinite without a bound."""
         gap = self.objective - self.lower_bound
         return max(0.0, gap) if gap == gap else np.inf
 
     @cached_property
     def moves(self) -> BoolArray:
         """Which planned changes are moves (not zero), shape (nc, m)."""
-        return self.changes != 0.0
+        moves: BoolArray = self.changes != 0.0
+        return moves
 
     @property
     def held(self) -> bool:

@@ -45,7 +45,9 @@ class MAMPC(Controller):
         MampcError: an unknown method, or rules that the method cannot keep.
     """
 
-    def __init__(self, problem: TrackingProblem, rules: MoveRules, *, method: str | Method = "alternating") -> None:
+    def __init__(
+        self, problem: TrackingProblem, rules: MoveRules, *, method: str | Method = "alternating"
+    ) -> None:
         super().__init__(problem)
         if not isinstance(rules, MoveRules):
             raise MampcError(f"rules: expected mampc.MoveRules, received {type(rules).__name__}")

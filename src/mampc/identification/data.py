@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array, as_matrix, as_number, as_vector
+from mampc.arrays import Array, as_array, as_matrix, as_number, as_vector, as_whole
 from mampc.errors import MampcError
 from mampc.lti import StateSpace
 from mampc.names import Names, require_count
@@ -42,7 +42,13 @@ class IOData:
     def __post_init__(self) -> None:
         u, y = (_column(name, getattr(self, name)) for name in ("u", "y"))
         if len(u) != len(y) or len(u) == 0:
-            raise MampcError(f"IOData: expected as many input as output samples, received {len(u)} and {len(y)}")
+            raise MampcError(
+                f"IOData: expected as many input as output samples, received {len(u)} and {len(y)}"
+            )
+        if u.shape[1] == 0 or y.shape[1] == 0:
+            raise MampcError(
+                f"IOData: expected at least one input and output, received {u.shape[1]} and {y.shape[1]}"
+            )
         names = Names.numbered(u.shape[1], y.shape[1]) if self.names is None else self.names
         names = replace(names, states=())
         require_count("names.inputs", names.inputs, u.shape[1])
@@ -133,7 +139,9 @@ def excite(
     """
     if isinstance(plant, StateSpace):
         if not plant.is_discrete or dt not in (None, plant.dt):
-            raise MampcError(f"excite: expected a discrete model and its dt, received {plant.dt:g} s and dt={dt}")
+            raise MampcError(
+                f"excite: expected a discrete model and its dt, received {plant.dt:g} s and dt={dt}"
+            )
         dt = plant.dt
     dt = as_number("dt", dt, 0.0, exclusive=True)
     m, l = len(plant.names.inputs), len(plant.names.outputs)
@@ -142,7 +150,8 @@ def excite(
     if isinstance(plant, StateSpace):
         y = plant.response(signal, x0)
     else:
-        x = plant.steady_state(getattr(plant, "u_op", signal[0])) if x0 is None else np.array(x0, dtype=float)
+        x = as_array("x0", plant.steady_state(getattr(plant, "u_op", signal[0])) if x0 is None else x0)
+        x = as_vector("x0", x, len(plant.names.states) or x.size)
         y = np.empty((len(signal), l))
         for k, inputs in enumerate(signal):
             y[k] = plant.output(x, inputs)
@@ -150,40 +159,49 @@ def excite(
     spread = as_vector("noise", noise, l)
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
-    y = y + spread * np.random.default_rng(seed).standard_normal(y.shape)
+    y = y + spread * np.random.default_rng(as_whole("seed", seed, 0)).standard_normal(y.shape)
     return IOData(signal, y, dt, plant.names)
 
 
 def _column(name: str, value: Any) -> Array:
-    array = np.asarray(value)
+    array = as_array(name, value)
     return as_matrix(name, array[:, None] if array.ndim == 1 else array)
 
 
-def _read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
+def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The header, and the other rows with the number of their line."""
     try:
         if path.stat().st_size > CSV_FILE_LIMIT:
-            raise MampcError(f"{path}: expected at most {CSV_FILE_LIMIT} bytes, received {path.stat().st_size}")
+            raise MampcError(
+                f"{path}: expected at most {CSV_FILE_LIMIT} bytes, received {path.stat().st_size}"
+            )
         with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [[field.strip() for field in row] for row in csv.reader(file) if row]
+            reader = csv.reader(file)
+            lines = [(reader.line_num, [field.strip() for field in row]) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise MampcError(f"{path}: expected a readable CSV file, received: {error}") from None
     if len(lines) < 2:
-        raise MampcError(f"{path}: expected a header and at least one row of numbers, received {len(lines)} rows")
-    for number, row in enumerate(lines[1:], start=2):
-        if len(row) != len(lines[0]):
-            raise MampcError(f"{path}: expected {len(lines[0])} fields in row {number}, received {len(row)}")
-    return lines[0], lines[1:]
+        raise MampcError(
+            f"{path}: expected a header and at least one row of numbers, received {len(lines)} rows"
+        )
+    header, rows = lines[0][1], lines[1:]
+    for number, row in rows:
+        if len(row) != len(header):
+            raise MampcError(f"{path}: expected {len(header)} fields in row {number}, received {len(row)}")
+    return header, rows
 
 
-def _numbers(path: Path, rows: list[list[str]], column: int, name: str) -> Array:
+def _numbers(path: Path, rows: list[tuple[int, list[str]]], column: int, name: str) -> Array:
     values = np.empty(len(rows))
-    for i, row in enumerate(rows):
+    for i, (number, row) in enumerate(rows):
         try:
             values[i] = float(row[column])
         except ValueError:
             values[i] = np.nan
         if not np.isfinite(values[i]):
-            raise MampcError(f"{path}: expected a number in row {i + 2}, column {name!r}, received {row[column]!r}")
+            raise MampcError(
+                f"{path}: expected a number in row {number}, column {name!r}, received {row[column]!r}"
+            )
     return values
 
 

@@ -11,11 +11,13 @@ theorem gives the weightings; Verhaegen, Automatica 30 (1994) for the projected 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import numpy as np
 
 from mampc.arrays import Array, as_whole
 from mampc.errors import MampcError
 from mampc.identification.data import IOData
+from mampc.identification.triangular import fold, solve
 from mampc.identification.validation import Validation, validate
 from mampc.lti import StateSpace
 
@@ -63,14 +65,14 @@ def n4sid(
         data: the record.
         order: n; default chosen from the singular values (see `choose_order`).
         weighting: "cva" (canonical variates: whitens the future outputs, best with noise), "n4sid" or
-            "moesp" (unweighted; in the projected form used here, which is SLICOT's, both have the same range).
+            "moesp" (unweighted; the same range in the projected form used here, which is SLICOT's).
         block_rows: s, how many samples past and future hold; default 15, less for short records, more
             for a high order.
         feedthrough: False fixes D = 0, as for sampled physical plants.
         unstable: "stabilise" mirrors poles outside the unit circle to its inside, "refuse" raises.
 
     Raises:
-        MampcError: a record too short, constant inputs, or an unstable model with unstable="refuse".
+        MampcError: a record too short, constant signals, or an unstable model with unstable="refuse".
     """
     if weighting not in WEIGHTINGS:
         raise MampcError(f"weighting: expected one of {WEIGHTINGS}, received {weighting!r}")
@@ -78,14 +80,22 @@ def n4sid(
         raise MampcError(f"unstable: expected 'stabilise' or 'refuse', received {unstable!r}")
     m, l = data.u.shape[1], data.y.shape[1]
     s = _block_rows(len(data), m, l, order, block_rows)
+    signals = zip((*data.names.inputs, *data.names.outputs), (*data.u.T, *data.y.T), strict=True)
+    still = [name for name, signal in signals if np.ptp(signal) == 0]
+    if still:
+        raise MampcError(f"n4sid: expected signals that vary, received constant {', '.join(still)}")
     u_op, y_op = data.u.mean(axis=0), data.y.mean(axis=0)
     u, y = data.u - u_op, data.y - y_op
 
-    gamma, singular_values = _observability(u, y, s, weighting)
+    R = _triangular_factor(u, y, s)
+    gamma, singular_values = _observability(R, m, l, s, weighting)
     if order is None:
-        order = choose_order(singular_values, len(data), m, l, s)
+        canonical = singular_values if weighting == "cva" else _observability(R, m, l, s, "cva")[1]
+        order = choose_order(canonical, len(data), m, l)
     if order > len(singular_values) - l:
-        raise MampcError(f"order: expected at most {len(singular_values) - l} with {s} block rows, received {order}")
+        raise MampcError(
+            f"order: expected at most {len(singular_values) - l} with {s} block rows, received {order}"
+        )
     gamma = gamma[:, :order]
     C = gamma[:l]
     A = np.linalg.lstsq(gamma[:-l], gamma[l:])[0]  # shift invariance
@@ -96,25 +106,25 @@ def n4sid(
     return Identified(model, quality.x0, singular_values, order, quality.fit, stabilised)
 
 
-def choose_order(singular_values: Array, samples: int, m: int, l: int, s: int) -> int:
-    """The order after which the singular values drop most, among those the record can support.
+def choose_order(correlations: Array, samples: int, m: int, l: int) -> int:
+    """The order after which the canonical correlations carry least, among those the record can support.
 
-    It supports orders up to the minimum of sigma_{n+1}^2, relative to the largest, plus log(N)/N times the
-    number of parameters 2 n l + m (n + l): the singular value criterion of Bauer, Automatica 37 (2001).
+    It supports orders up to the minimum of rho_{n+1}^2 plus log(N)/N times the number of parameters
+    2 n l + m (n + l): the singular value criterion of Bauer, Automatica 37 (2001). Among these the
+    information -log(1 - rho^2) that past and future share drops most, as a ratio, behind the chosen one.
 
     Args:
-        singular_values: as found by `n4sid`, shape (s * l,).
-        samples, m, l, s: length of the record, numbers of inputs, outputs and block rows.
+        correlations: canonical correlations, the singular values of weighting "cva", shape (s * l,).
+        samples, m, l: length of the record, numbers of inputs and outputs.
 
     Returns:
         An order of at least 1.
     """
-    n = np.arange(1, len(singular_values) - l)
-    relative = (singular_values / singular_values[0]) ** 2
-    parameters = 2 * n * l + m * (n + l)
-    most = int(n[np.argmin(relative[n] + np.log(samples) / samples * parameters)])
-    drops = singular_values[:most] / np.maximum(singular_values[1 : most + 1], 1e-300)
-    return int(np.argmax(drops)) + 1
+    n = np.arange(1, max(2, len(correlations) - l))
+    squared = np.minimum(correlations**2, 1 - 1e-12)  # a noise-free record correlates perfectly
+    most = int(n[np.argmin(squared[n] + np.log(samples) / samples * (2 * n * l + m * (n + l)))])
+    information = -np.log1p(-squared)
+    return int(np.argmax(information[:most] / np.maximum(information[1 : most + 1], 1e-300))) + 1
 
 
 def _block_rows(samples: int, m: int, l: int, order: int | None, block_rows: int | None) -> int:
@@ -136,10 +146,14 @@ def _block_rows(samples: int, m: int, l: int, order: int | None, block_rows: int
     return s
 
 
-def _observability(u: Array, y: Array, s: int, weighting: str) -> tuple[Array, Array]:
-    """Range of the observability matrix, shape (s l, s l), and the weighted singular values."""
-    m, l = u.shape[1], y.shape[1]
-    R = _triangular_factor(u, y, s)
+def _observability(R: Array, m: int, l: int, s: int, weighting: str) -> tuple[Array, Array]:
+    """Range of the observability matrix, shape (s l, s l), and the weighted singular values.
+
+    A record that starts or ends in a transient has means that are not a rest of the system: what is left
+    is a constant, which would pass for one more mode. "cva" projects it off; "n4sid" and "moesp" keep it,
+    as SLICOT does.
+    """
+    R = R[1:, 1:] if weighting == "cva" else fold(R[:1, 1:], R[1:, 1:])
     future_u, past = s * m, s * (m + l)
     conditioned = np.abs(np.diag(R)[: future_u + s * m])
     if not conditioned.min() > 1e-10 * max(conditioned.max(), 1e-300):
@@ -160,21 +174,21 @@ def _observability(u: Array, y: Array, s: int, weighting: str) -> tuple[Array, A
 
 
 def _triangular_factor(u: Array, y: Array, s: int) -> Array:
-    """R of the QR factorisation of the Hankel rows (U_f, U_p, Y_p, Y_f), transposed, in chunks.
+    """R of the QR factorisation of the Hankel rows (1, U_f, U_p, Y_p, Y_f), transposed, in chunks.
 
     Memory is that of one chunk, whatever the length of the record.
     """
     columns = len(u) - 2 * s + 1
     windows_u = np.lib.stride_tricks.sliding_window_view(u, 2 * s, axis=0)  # (columns, m, 2 s)
     windows_y = np.lib.stride_tricks.sliding_window_view(y, 2 * s, axis=0)
-    R = np.empty((0, 2 * s * (u.shape[1] + y.shape[1])))
+    R: Array = np.empty((0, 1 + 2 * s * (u.shape[1] + y.shape[1])))
     for start in range(0, columns, _CHUNK):
         chunk = slice(start, start + _CHUNK)
         U = windows_u[chunk].transpose(0, 2, 1)
         Y = windows_y[chunk].transpose(0, 2, 1)
         parts = (U[:, s:], U[:, :s], Y[:, :s], Y[:, s:])
-        hankel = np.concatenate([part.reshape(len(U), -1) for part in parts], axis=1)
-        R = np.linalg.qr(np.concatenate([R, hankel]), mode="r")
+        hankel = [np.ones((len(U), 1)), *(part.reshape(len(U), -1) for part in parts)]
+        R = fold(R, np.concatenate(hankel, axis=1))
     return R
 
 
@@ -195,16 +209,16 @@ def _inside_unit_circle(A: Array, unstable: str) -> tuple[Array, bool]:
 
 
 def _input_matrices(A: Array, C: Array, u: Array, y: Array, feedthrough: bool) -> tuple[Array, Array]:
-    """B and D, with x0, by least squares on the simulation error: y is linear in all three.
+    """B and D by least squares on the simulation error, to which x0 and a constant contribute too.
 
     Column (i, j) of the response to B is the output of (A, e_i, C) driven by input j.
     """
     n, m, l = len(A), u.shape[1], len(C)
-    unknowns = n * m + n + (l * m if feedthrough else 0)
+    unknowns = n * m + n + l + (l * m if feedthrough else 0)
     state = np.zeros((n, n * m + n))
     state[:, n * m :] = np.eye(n)
     picks = np.eye(n)
-    normal = np.empty((0, unknowns + 1))
+    normal: Array = np.empty((0, unknowns + 1))
     for start in range(0, len(u), _CHUNK):
         block = u[start : start + _CHUNK]
         rows = np.zeros((len(block), l, unknowns + 1))
@@ -214,13 +228,13 @@ def _input_matrices(A: Array, C: Array, u: Array, y: Array, feedthrough: bool) -
             state = A @ state
             state[:, : n * m] += np.kron(picks, inputs)
         rows[:, :, : n * m + n] = C @ states
+        rows[:, :, n * m + n : n * m + n + l] = np.eye(l)
         if feedthrough:
-            rows[:, :, n * m + n : -1] = np.einsum("op,kj->kopj", np.eye(l), block).reshape(len(block), l, l * m)
+            direct = np.einsum("op,kj->kopj", np.eye(l), block)
+            rows[:, :, n * m + n + l : -1] = direct.reshape(len(block), l, l * m)
         rows[:, :, -1] = y[start : start + _CHUNK]
-        normal = np.linalg.qr(np.concatenate([normal, rows.reshape(-1, unknowns + 1)]), mode="r")
-    solution = np.linalg.lstsq(normal[:, :-1], normal[:, -1], rcond=1e-12)[0]
+        normal = fold(normal, rows.reshape(-1, unknowns + 1))
+    solution = solve(normal)
     B = solution[: n * m].reshape(n, m)
-    D = solution[n * m + n :].reshape(l, m) if feedthrough else np.zeros((l, m))
+    D = solution[n * m + n + l :].reshape(l, m) if feedthrough else np.zeros((l, m))
     return B, D
-
-

@@ -9,6 +9,7 @@ import numpy as np
 from mampc.arrays import Array
 from mampc.errors import MampcError
 from mampc.identification.data import IOData
+from mampc.identification.triangular import fold, solve
 from mampc.lti import StateSpace
 
 
@@ -65,7 +66,7 @@ def fit(y: Array, y_hat: Array) -> Array:
 def initial_state(model: StateSpace, data: IOData) -> Array:
     """The state at the first sample that fits the outputs best, shape (n,); least squares."""
     unexplained = data.y - model.response(data.u)
-    normal = np.empty((0, model.n_states + 1))
+    normal: Array = np.empty((0, model.n_states + 1))
     rows, block = model.C, 2048
     for start in range(0, len(data), block):
         free = np.empty((len(unexplained[start : start + block]), *model.C.shape))
@@ -73,9 +74,8 @@ def initial_state(model: StateSpace, data: IOData) -> Array:
             free[k] = rows
             rows = rows @ model.A
         stacked = np.concatenate([free, unexplained[start : start + block, :, None]], axis=2)
-        normal = np.linalg.qr(np.concatenate([normal, stacked.reshape(-1, model.n_states + 1)]), mode="r")
-    x0: Array = np.linalg.lstsq(normal[:, :-1], normal[:, -1], rcond=1e-12)[0]
-    return x0
+        normal = fold(normal, stacked.reshape(-1, model.n_states + 1))
+    return solve(normal)
 
 
 def whiteness(residuals: Array, lags: int = 20) -> Array:

@@ -48,8 +48,6 @@ def advance(plant: Plant, x: Array, u: Array, dt: float) -> Array:
         lambda _, state: plant.derivative(state, u), (0.0, dt), x, method="LSODA", rtol=1e-8, atol=1e-9
     )
     if not result.success or not np.isfinite(result.y[:, -1]).all():
-        raise MampcError(
-            f"{type(plant).__name__}: the integration failed at inputs {u}: {result.message}"
-        )
+        raise MampcError(f"{type(plant).__name__}: the integration failed at inputs {u}: {result.message}")
     end: Array = result.y[:, -1]
     return end

@@ -46,6 +46,8 @@ class QuadrupleTank:
             values = as_vector(name, getattr(self, name), size)
             if name not in ("gamma", "u_op") and (values <= 0).any():
                 raise MampcError(f"QuadrupleTank.{name}: expected positive numbers, received {values}")
+            if name == "u_op" and (values < 0).any():
+                raise MampcError(f"QuadrupleTank.u_op: expected no negative input, received {values}")
             object.__setattr__(self, name, tuple(map(float, values)))
         as_number("QuadrupleTank.gravity", self.gravity, 0.0, exclusive=True)
         as_number("QuadrupleTank.k_c", self.k_c, 0.0, exclusive=True)

@@ -1,0 +1,60 @@
+# Every target sets up what it needs in .venv, from a fresh clone, with Python >= 3.11, git and make.
+PYTHON ?= python3
+UV_DIR := .uv
+UV := $(shell command -v uv 2>/dev/null || echo $(UV_DIR)/bin/uv)
+BIN := .venv/bin
+export UV_COMPILE_BYTECODE := 1
+export UV_PYTHON_DOWNLOADS := never
+export UV_LINK_MODE := copy
+export VIRTUAL_ENV := $(CURDIR)/.venv
+
+.PHONY: demo test lint format bench figures lock clean help
+.DEFAULT_GOAL := help
+
+help:  ## what can be made
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+demo: .venv/run.stamp  ## run the quadruple-tank study: a table, results/quadruple-tank with figures
+	$(BIN)/mampc run quadruple-tank --out results/quadruple-tank
+
+test: .venv/dev.stamp  ## run the tests
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: .venv/dev.stamp  ## style, types and the layers of imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: .venv/dev.stamp  ## put the code in shape
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: .venv/dev.stamp  ## speed, as ratios measured side by side
+	$(BIN)/python benchmarks/bench.py
+
+figures: .venv/run.stamp  ## redraw the figures of the documentation
+	$(BIN)/python docs/draw_figures.py
+
+lock: .venv/dev.stamp  ## pin the versions that tests and demo use
+	$(UV) export --quiet --no-hashes --no-emit-project --no-header --no-annotate \
+	  --all-extras --group dev --output-file requirements.lock
+	rm -f uv.lock
+
+clean:  ## remove environments and caches
+	rm -rf .venv .uv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+
+.venv/pyvenv.cfg:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "mampc needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
+	command -v uv >/dev/null 2>&1 || test -x $(UV_DIR)/bin/uv \
+	  || { $(PYTHON) -m venv $(UV_DIR) && $(UV_DIR)/bin/python -m pip install --quiet uv; }
+	$(UV) venv --quiet --allow-existing --python $(PYTHON) .venv
+
+.venv/run.stamp: .venv/pyvenv.cfg pyproject.toml requirements.lock
+	$(UV) pip install --quiet --constraint requirements.lock --editable '.[plot]'
+	@touch $@
+
+.venv/dev.stamp: .venv/pyvenv.cfg pyproject.toml requirements.lock
+	$(UV) pip install --quiet --requirement requirements.lock --editable '.[plot]'
+	@touch $@ .venv/run.stamp

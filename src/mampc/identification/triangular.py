@@ -1,0 +1,18 @@
+"""Least squares on long records in little memory: only the triangular factor is kept."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mampc.arrays import Array
+
+
+def fold(R: Array, rows: Array) -> Array:
+    """The triangular factor of all rows so far: that of R on top of the new rows."""
+    return np.asarray(np.linalg.qr(np.concatenate([R, rows]), mode="r"))
+
+
+def solve(R: Array) -> Array:
+    """Least-squares solution where the last column of the folded rows is the right-hand side."""
+    solution: Array = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=1e-12)[0]
+    return solution

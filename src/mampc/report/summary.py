@@ -1,0 +1,74 @@
+"""A study's result as numbers: what summary.json holds and the tables show."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mampc.metrics import Metrics
+from mampc.simulation import Run
+from mampc.study import StudyResult
+
+
+def summarise(result: StudyResult) -> dict[str, Any]:
+    """The content of summary.json: plain numbers, lists and text, no number that JSON cannot hold."""
+    study, model, identified = result.study, result.model, result.identified
+    return {
+        "study": study.name,
+        "steps": study.steps,
+        "dt": study.dt,
+        "warnings": list(result.warnings),
+        "model": {
+            "order": model.n_states,
+            "inputs": list(model.names.inputs),
+            "outputs": list(model.names.outputs),
+            "largest_pole": float(np.abs(model.poles()).max()),
+            "fit_percent": None if identified is None else [round(float(fit), 3) for fit in identified.fit],
+        },
+        "scenarios": [
+            {
+                "name": scenario.name,
+                "noise": scenario.noise,
+                "seed": scenario.seed,
+                "controllers": [
+                    {
+                        "name": table.name,
+                        **_controller(result.runs[scenario.name][table.name], study.threshold, study.skip),
+                    }
+                    for table in study.controllers
+                ],
+            }
+            for scenario in study.scenarios
+        ],
+    }
+
+
+def _controller(run: Run, threshold: float, skip: int) -> dict[str, Any]:
+    microseconds = run.solve_times * 1e6
+    return {
+        **_metrics(run.metrics(threshold=threshold)),
+        "without_transient": {"skipped": skip, **_metrics(run.metrics(threshold=threshold, skip=skip))},
+        "solve_time_us": {
+            "median": float(np.median(microseconds)),
+            "p99": float(np.percentile(microseconds, 99)),
+            "max": float(microseconds.max()),
+        },
+        "status": run.statuses,
+    }
+
+
+def _metrics(metrics: Metrics) -> dict[str, Any]:
+    return {
+        "sparse_density": {
+            "threshold": metrics.threshold,
+            "per_input": metrics.sparse_density.tolist(),
+            "exact_per_input": metrics.exact_density.tolist(),
+        },
+        "tracking_error": metrics.tracking_error,
+        "travel_per_input": metrics.travel.tolist(),
+        "moves": int(metrics.moves.sum()),
+        "moves_per_input": metrics.moves.tolist(),
+        "reversals_per_input": metrics.reversals.tolist(),
+        "mean_hold_time_per_input": metrics.mean_hold_time.tolist(),
+    }

@@ -1,0 +1,89 @@
+"""The comparison table on the terminal: every controller beside the baseline and published figures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+from mampc.study.schema import ControllerTable, PublishedTable, Study
+
+
+def comparison_tables(study: Study, summary: dict[str, Any]) -> list[Table]:
+    """Two tables a scenario: all samples, and without the first `skip`."""
+    tables = []
+    for scenario in summary["scenarios"]:
+        tables.append(_table(study, scenario, None))
+        if study.skip:
+            tables.append(_table(study, scenario, "without_transient"))
+    return tables
+
+
+def baseline(study: Study) -> ControllerTable:
+    """The controller that ratios refer to: the first plain MPC, or the first of all."""
+    return next((table for table in study.controllers if table.method == "mpc"), study.controllers[0])
+
+
+def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
+    base = baseline(study)
+    samples = f"all {study.steps} samples" if part is None else f"without the first {study.skip} samples"
+    table = Table(
+        title=f"{study.name}, {scenario['name']} — {samples}", title_justify="left", title_style="bold"
+    )
+    published = any(_published(controller, part) for controller in study.controllers)
+    table.add_column("controller", no_wrap=True)
+    headers = [
+        f"changes\n> {study.threshold:g}",
+        "changes\nat all",
+        "tracking\nerror",
+        f"changes, error\n/ {base.name}",
+    ]
+    headers += ["published\nchanges", "published\nerror", f"published\n/ {base.name}"] if published else []
+    for header in [*headers, "step\nµs"]:
+        table.add_column(header, justify="right", no_wrap=True)
+    entries = {entry["name"]: entry if part is None else entry[part] for entry in scenario["controllers"]}
+    times = {entry["name"]: entry["solve_time_us"]["median"] for entry in scenario["controllers"]}
+    for controller in study.controllers:
+        entry, reference = entries[controller.name], entries[base.name]
+        density = entry["sparse_density"]
+        row = [
+            controller.name,
+            _several(density["per_input"]),
+            _several(density["exact_per_input"]),
+            f"{entry['tracking_error']:.3f}",
+            _ratios(
+                density["per_input"], reference["sparse_density"]["per_input"],
+                entry["tracking_error"], reference["tracking_error"],
+            ),
+        ]  # fmt: skip
+        if published:
+            row += _published_cells(_published(controller, part), _published(base, part))
+        table.add_row(*row, f"{times[controller.name]:.0f}")
+    return table
+
+
+def _published(controller: ControllerTable, part: str | None) -> PublishedTable | None:
+    figures = controller.published
+    return figures if figures is None or part is None else figures.without_transient
+
+
+def _published_cells(figures: PublishedTable | None, base: PublishedTable | None) -> list[str]:
+    if figures is None:
+        return ["", "", ""]
+    cells = [_several(figures.sparse_density), f"{figures.tracking_error:.3f}"]
+    if base is None:
+        return [*cells, ""]
+    ratios = _ratios(figures.sparse_density, base.sparse_density, figures.tracking_error, base.tracking_error)
+    return [*cells, ratios]
+
+
+def _several(values: list[float]) -> str:
+    return " ".join(f"{value:.3f}" for value in values)
+
+
+def _ratios(density: list[float], base_density: list[float], error: float, base_error: float) -> str:
+    return f"{_ratio(sum(density), sum(base_density))}, {_ratio(error, base_error)}"
+
+
+def _ratio(value: float, base: float) -> str:
+    return f"{value / base:.2f}" if base > 0 else "-"

@@ -1,0 +1,174 @@
+"""What a study file may say: one class a table, one field a key."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
+
+from mampc.controllers.mampc import METHODS
+from mampc.plants import QuadrupleTank
+from mampc.problem import LONGEST_HORIZON
+
+PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank}
+LONGEST_RUN = 1_000_000  # samples
+
+_SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+def _time(value: Any) -> Any:
+    """A number of seconds, or text with a unit of time."""
+    if not isinstance(value, str):
+        return value
+    match = re.fullmatch(r"\s*([-+.\deE]+)\s*([A-Za-z%/]*)\s*", value)
+    if match is None or match[2] not in _SECONDS:
+        raise ValueError(f"a time such as 10.0 or '10 s' (units {', '.join(_SECONDS)})")
+    try:
+        return float(match[1]) * _SECONDS[match[2]]
+    except ValueError:
+        raise ValueError(f"a time such as 10.0 or '10 s' (units {', '.join(_SECONDS)})") from None
+
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Time = Annotated[float, BeforeValidator(_time), Field(gt=0, allow_inf_nan=False)]
+Values = Number | list[Number]
+Weight = Number | list[Number] | list[list[Number]]
+Word = Annotated[str, Field(min_length=1, max_length=80)]
+
+
+class Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class PlantTable(Table):
+    kind: Word
+    parameters: dict[str, Any] = {}
+
+
+class ModelTable(Table):
+    file: Word
+
+
+class IdentificationTable(Table):
+    order: Annotated[int, Field(ge=1, le=200)] | None = None
+    weighting: Literal["cva", "n4sid", "moesp"] = "cva"
+    feedthrough: bool = False
+    prbs_order: Annotated[int, Field(ge=2, le=16)] = 8
+    amplitude: Values
+    hold: Annotated[int, Field(ge=1, le=10_000)] = 1
+    noise: Values = 0.0
+    seed: Annotated[int, Field(ge=0)] = 1
+
+
+class LimitsTable(Table):
+    u_min: Values | None = None
+    u_max: Values | None = None
+    du_max: Values | None = None
+    y_min: Values | None = None
+    y_max: Values | None = None
+
+
+class ProblemTable(Table):
+    prediction_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)]
+    control_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)]
+    output_weight: Weight = 1.0
+    move_weight: Weight = 0.1
+    limits: LimitsTable = LimitsTable()
+    weigh_first_move: bool = True
+    output_limit_weight: Positive | None = None
+
+
+class ChangeTable(Table):
+    at: Annotated[int, Field(ge=0)]
+    value: Values
+
+
+class ReferenceTable(Table):
+    relative: bool = True
+    preview: bool = False
+    initial: list[Number]
+    changes: list[ChangeTable] = []
+
+
+class ScenarioTable(Table):
+    name: Word
+    noise: Values = 0.0
+    seed: Annotated[int, Field(ge=0)] = 0
+    input_disturbance: Values | None = None
+    output_disturbance: Values | None = None
+    disturbance_at: Annotated[int, Field(ge=0)] = 0
+
+
+class PublishedTable(Table):
+    sparse_density: list[Number]
+    tracking_error: Number
+    without_transient: PublishedTable | None = None
+
+
+class RulesTable(Table):
+    max_moves: Annotated[int, Field(ge=0)] | None = None
+    sparsity_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = 1
+
+
+class ControllerTable(Table):
+    name: Word
+    method: Word
+    rules: RulesTable | None = None
+    settings: dict[str, Any] = {}
+    published: PublishedTable | None = None
+
+    @model_validator(mode="after")
+    def _rules_where_needed(self) -> ControllerTable:
+        if self.method not in ("mpc", *METHODS):
+            raise ValueError(f"a method, one of {', '.join(('mpc', *METHODS))}; received {self.method!r}")
+        if self.method != "mpc" and self.rules is None:
+            raise ValueError(f"rules for the method {self.method!r}, such as rules = {{ max_moves = 3 }}")
+        if self.method == "mpc" and (self.rules is not None or self.settings):
+            raise ValueError("neither rules nor settings for the method 'mpc', which has none")
+        return self
+
+
+class Study(Table):
+    """A checked study; attributes are the keys of the file."""
+
+    name: Word
+    steps: Annotated[int, Field(ge=1, le=LONGEST_RUN)]
+    dt: Time
+    threshold: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
+    skip: Annotated[int, Field(ge=0)] = 0
+    plant: PlantTable
+    identification: IdentificationTable | None = None
+    model: ModelTable | None = None
+    problem: ProblemTable
+    reference: ReferenceTable
+    scenarios: Annotated[list[ScenarioTable], Field(min_length=1)]
+    controllers: Annotated[list[ControllerTable], Field(min_length=1)]
+
+    _folder: Path = PrivateAttr(default=Path())
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Study:
+        if (self.identification is None) == (self.model is None):
+            raise ValueError("one of the tables [identification] and [model]")
+        if self.plant.kind not in ("model", *PLANTS):
+            known = ", ".join(sorted(("model", *PLANTS)))
+            raise ValueError(f"a plant.kind among {known}; received {self.plant.kind!r}")
+        if self.plant.kind == "model" and self.model is None:
+            raise ValueError("a table [model] with a file for plant.kind = 'model'")
+        if self.plant.kind == "model" and self.plant.parameters:
+            raise ValueError("no plant.parameters for plant.kind = 'model'")
+        if self.skip >= self.steps:
+            raise ValueError(f"a skip below the {self.steps} steps; received {self.skip}")
+        for kind in ("scenarios", "controllers"):
+            names = [file_word(table.name) for table in getattr(self, kind)]
+            if len(set(names)) != len(names):
+                raise ValueError(f"{kind} with names that differ in letters or digits; received {names}")
+        return self
+
+
+def file_word(name: str) -> str:
+    """A name as it stands in file names."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
