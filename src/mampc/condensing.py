@@ -262,10 +262,16 @@ class CondensedQP:
         if output_disturbance is not None or input_disturbance is not None:
             disturbances = disturbances.copy()
             m = len(u_previous)
-            if input_disturbance is not None:
-                disturbances[:m] = input_disturbance
-            if output_disturbance is not None:
-                disturbances[m:-1] = output_disturbance
+            try:
+                if input_disturbance is not None:
+                    disturbances[:m] = input_disturbance
+                if output_disturbance is not None:
+                    disturbances[m:-1] = output_disturbance
+            except (TypeError, ValueError) as error:
+                raise MampcError(
+                    f"disturbances: expected {m} at the inputs, {len(disturbances) - m - 1} at the outputs, "
+                    f"received others: {error}"
+                ) from None
         if reference.ndim == 1:
             data = self._constant_map.dot(np.concatenate((x, u_previous, disturbances, reference)))
         else:

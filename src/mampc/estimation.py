@@ -63,6 +63,8 @@ class KalmanFilter:
             MampcError: a continuous model, or one whose disturbances cannot be told apart from its
                 states with these outputs.
         """
+        if not isinstance(model, StateSpace):
+            raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
         if not model.is_discrete:
             raise MampcError("offset_free: expected a discrete model, received dt = 0; discretise it first")
         if disturbance not in ("output", "input"):

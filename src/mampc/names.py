@@ -10,14 +10,18 @@ from mampc.errors import MampcError
 
 @dataclass(frozen=True)
 class Names:
-    """Names of the inputs, outputs and states of a plant or model, each a tuple of distinct words."""
+    """Names of the inputs, outputs and states of a plant or model, each a tuple of distinct words.
+
+    `disturbances` are inputs of a plant that are measured but not manipulated.
+    """
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     states: tuple[str, ...] = ()
+    disturbances: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for kind in ("inputs", "outputs", "states"):
+        for kind in ("inputs", "outputs", "states", "disturbances"):
             names = tuple(getattr(self, kind))
             if any(not isinstance(name, str) or not name for name in names):
                 raise MampcError(f"names.{kind}: expected non-empty words, received {names!r}")

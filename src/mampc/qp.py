@@ -24,7 +24,7 @@ LARGEST = 1e150  # sizes whose products are still numbers
 
 def is_usable(vector: Array) -> bool:
     """Whether all entries, one at least, are numbers of a size to calculate with; never warns."""
-    return bool(-LARGEST < vector[vector.argmin()] and vector[vector.argmax()] < LARGEST)
+    return bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
 
 
 class QPStatus(Enum):

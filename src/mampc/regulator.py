@@ -32,10 +32,14 @@ class Regulator:
         estimator: default `KalmanFilter.offset_free` of the controller's model.
 
     Raises:
-        MampcError: an estimator of a model of other dimensions.
+        MampcError: arguments of other types, or an estimator of a model of other dimensions.
     """
 
     def __init__(self, controller: Controller, estimator: KalmanFilter | None = None) -> None:
+        if not isinstance(controller, Controller):
+            raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
+        if not isinstance(estimator, KalmanFilter | None):
+            raise MampcError(f"estimator: expected a KalmanFilter, received {type(estimator).__name__}")
         model = controller.problem.model
         self.controller = controller
         self._y_shape = (model.n_outputs,)

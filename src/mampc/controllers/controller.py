@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.arrays import Array, as_vector
+from mampc.arrays import Array, as_array, as_vector
 from mampc.condensing import CondensedQP, Instance
 from mampc.controllers.decision import ControllerState, Decision, Status
 from mampc.errors import MampcError
@@ -76,7 +76,7 @@ class Controller(ABC):
                 operating point. Missing earlier inputs are taken to have been the same.
         """
         m = self.problem.model.n_inputs
-        u = np.asarray(self.problem.model.u_op if u_previous is None else u_previous, dtype=float)
+        u = as_array("u_previous", self.problem.model.u_op if u_previous is None else u_previous)
         if u.ndim == 2 and u.shape[0] >= 1:
             past = np.stack([as_vector("u_previous", row, m) for row in u])
         else:

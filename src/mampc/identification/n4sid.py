@@ -88,10 +88,12 @@ def n4sid(
     u, y = data.u - u_op, data.y - y_op
 
     R = _triangular_factor(u, y, s)
+    _require_excitation(R, m, s)
     gamma, singular_values = _observability(R, m, l, s, weighting)
     if order is None:
-        canonical = singular_values if weighting == "cva" else _observability(R, m, l, s, "cva")[1]
-        order = choose_order(canonical, len(data), m, l)
+        projected, remainder = _projection(R[1:, 1:], m, l, s)
+        energies = np.linalg.svd(projected, compute_uv=False)
+        order = choose_order(_canonical(projected, remainder)[1], energies, len(data), m, l)
     if order > len(singular_values) - l:
         raise MampcError(
             f"order: expected at most {len(singular_values) - l} with {s} block rows, received {order}"
@@ -106,25 +108,29 @@ def n4sid(
     return Identified(model, quality.x0, singular_values, order, quality.fit, stabilised)
 
 
-def choose_order(correlations: Array, samples: int, m: int, l: int) -> int:
-    """The order after which the canonical correlations carry least, among those the record can support.
+def choose_order(correlations: Array, energies: Array, samples: int, m: int, l: int) -> int:
+    """The number of modes that matter, among those the record can support.
 
-    It supports orders up to the minimum of rho_{n+1}^2 plus log(N)/N times the number of parameters
-    2 n l + m (n + l): the singular value criterion of Bauer, Automatica 37 (2001). Among these the
-    information -log(1 - rho^2) that past and future share drops most, as a ratio, behind the chosen one.
+    The record supports orders up to the minimum of rho_{n+1}^2 plus log(N)/N times the number of
+    parameters 2 n l + m (n + l): the singular value criterion of Bauer, Automatica 37 (2001). Among
+    these, modes count whose energy is above 2 % of the largest, and all before the last drop of the
+    energies by a factor of 3: weak modes of a clean record, but not the weak ones into which a nonlinear
+    plant's record fades.
 
     Args:
-        correlations: canonical correlations, the singular values of weighting "cva", shape (s * l,).
+        correlations: canonical correlations rho, the singular values of weighting "cva", shape (s * l,).
+        energies: singular values without weighting, shape (s * l,).
         samples, m, l: length of the record, numbers of inputs and outputs.
 
     Returns:
         An order of at least 1.
     """
     n = np.arange(1, max(2, len(correlations) - l))
-    squared = np.minimum(correlations**2, 1 - 1e-12)  # a noise-free record correlates perfectly
-    most = int(n[np.argmin(squared[n] + np.log(samples) / samples * (2 * n * l + m * (n + l)))])
-    information = -np.log1p(-squared)
-    return int(np.argmax(information[:most] / np.maximum(information[1 : most + 1], 1e-300))) + 1
+    parameters = 2 * n * l + m * (n + l)
+    most = int(n[np.argmin(correlations[n] ** 2 + np.log(samples) / samples * parameters)])
+    strong = int(np.count_nonzero(energies[:most] > 0.02 * energies[0]))
+    drops = np.flatnonzero(energies[:most] > 3 * energies[1 : most + 1])
+    return max(1, strong, int(drops[-1]) + 1 if len(drops) else 0)
 
 
 def _block_rows(samples: int, m: int, l: int, order: int | None, block_rows: int | None) -> int:
@@ -153,24 +159,35 @@ def _observability(R: Array, m: int, l: int, s: int, weighting: str) -> tuple[Ar
     is a constant, which would pass for one more mode. "cva" projects it off; "n4sid" and "moesp" keep it,
     as SLICOT does.
     """
-    R = R[1:, 1:] if weighting == "cva" else fold(R[:1, 1:], R[1:, 1:])
-    future_u, past = s * m, s * (m + l)
-    conditioned = np.abs(np.diag(R)[: future_u + s * m])
-    if not conditioned.min() > 1e-10 * max(conditioned.max(), 1e-300):
+    if weighting == "cva":
+        return _canonical(*_projection(R[1:, 1:], m, l, s))
+    projected, _ = _projection(fold(R[:1, 1:], R[1:, 1:]), m, l, s)
+    left, singular_values, _ = np.linalg.svd(projected)
+    return left, singular_values
+
+
+def _projection(R: Array, m: int, l: int, s: int) -> tuple[Array, Array]:
+    """The future outputs off the future inputs: their part along the past, and the rest; factors only."""
+    future, past = s * m, s * (m + l)
+    return R[future : future + past, future + past :].T, R[future + past :, future + past :].T
+
+
+def _canonical(projected: Array, remainder: Array) -> tuple[Array, Array]:
+    """The range after whitening the future outputs, and the canonical correlations with the past."""
+    values, vectors = np.linalg.eigh(projected @ projected.T + remainder @ remainder.T)
+    floor = np.sqrt(np.maximum(values, values[-1] * 1e-14))  # noise-free records have flat directions
+    left, correlations, _ = np.linalg.svd((vectors / floor).T @ projected)
+    return (vectors * floor) @ left, correlations
+
+
+def _require_excitation(R: Array, m: int, s: int) -> None:
+    """The inputs must be linearly independent over 2 s samples, and not constant."""
+    size = np.abs(np.diag(R)[1 : 1 + 2 * s * m])
+    if not size.min() > 1e-10 * max(size.max(), 1e-300):
         raise MampcError(
             f"n4sid: expected inputs that excite {2 * s} samples' span, received too poor or constant ones; "
             "use a longer or richer record, or fewer block_rows"
         )
-    projected = R[future_u : future_u + past, future_u + past :].T  # Y_f off U_f, onto the past
-    if weighting != "cva":
-        left, singular_values, _ = np.linalg.svd(projected)
-        return left, singular_values
-    remainder = R[future_u + past :, future_u + past :].T
-    covariance = projected @ projected.T + remainder @ remainder.T
-    values, vectors = np.linalg.eigh(covariance)
-    floor = np.sqrt(np.maximum(values, values[-1] * 1e-14))  # noise-free records have flat directions
-    left, singular_values, _ = np.linalg.svd((vectors / floor).T @ projected)
-    return (vectors * floor) @ left, singular_values
 
 
 def _triangular_factor(u: Array, y: Array, s: int) -> Array:

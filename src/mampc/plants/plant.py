@@ -43,10 +43,14 @@ def advance(plant: Plant, x: Array, u: Array, dt: float) -> Array:
     """
     from scipy.integrate import solve_ivp
 
+    def rate(_: float, state: Array) -> Array:
+        change = plant.derivative(state, u)
+        if not np.isfinite(change).all():  # LSODA would never return
+            raise MampcError(f"{type(plant).__name__}: the integration failed at inputs {u}: rates {change}")
+        return change
+
     # Tight enough that the simulation error stays far below any measurement noise.
-    result = solve_ivp(
-        lambda _, state: plant.derivative(state, u), (0.0, dt), x, method="LSODA", rtol=1e-8, atol=1e-9
-    )
+    result = solve_ivp(rate, (0.0, dt), x, method="LSODA", rtol=1e-8, atol=1e-9)
     if not result.success or not np.isfinite(result.y[:, -1]).all():
         raise MampcError(f"{type(plant).__name__}: the integration failed at inputs {u}: {result.message}")
     end: Array = result.y[:, -1]
