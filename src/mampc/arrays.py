@@ -13,6 +13,13 @@ Array: TypeAlias = npt.NDArray[np.floating[Any]]  # float64 throughout
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
+LARGEST = 1e12  # in engineering units; beyond it a number is a fault, and double precision has little left
+
+
+def is_usable(vector: Array) -> bool:
+    """Whether all entries, one at least, are numbers below `LARGEST` in size; never warns."""
+    return bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
+
 
 def as_array(name: str, value: Any) -> Array:
     """A new, contiguous float64 array; raises `MampcError` for text, ragged lists or complex numbers."""

@@ -3,22 +3,23 @@
 With the step response S_i = D + sum_{k<i} C A^k B of the model, the predicted outputs are
 
     y_i = free_i + sum_{j <= min(i, nc-1)} S_{i-j} du_j
-    free_i = y_op + C A^i x + S_i (u_prev + d_u - u_op) + d_y        (no more moves)
+    free_i = y_op + C A^i x + S_i (u_prev + d_u - u_op) + S^v_i (v - v_op) + d_y      (no more moves)
 
-with constant disturbances d_u at the inputs and d_y at the outputs. With `theta` the lower
+with constant disturbances: d_u at the inputs, d_y at the outputs, and measured ones v with their own step
+response S^v. With `theta` the lower
 block-triangular matrix of step responses and error = r - free
 
     cost = |error - theta d|^2_Q + |d|^2_R = 1/2 d' H d + f' d + |error|^2_Q
     H = 2 (theta' Q theta + R),   f = -2 theta' Q error,   d = (du_0, ..., du_{nc-1}).
 
 Everything that changes from sample to sample (f, the bounds, the error, and the optimum as long as no
-limit is active) is affine in the parameter p = (x, u_prev, d_u, d_y, 1, r): one matrix-vector product.
+limit is active) is affine in the parameter p = (x, u_prev, d_u, d_y, v, 1, r): one matrix-vector product.
 Where outputs are limited, one violation per limited output stands before the moves: z = (violations, d).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -140,7 +141,7 @@ class CondensedQP:
             )
         self.theta = np.zeros(((n_p + 1) * l, self.n_moves))
         for j in range(n_c):
-            self.theta[j * l :, j * m : (j + 1) * m] = step[: n_p + 1 - j].reshape(-1, m)
+            self.theta[j * l :, j * m : (j + 1) * m] = step[: n_p + 1 - j, :, :m].reshape(-1, m)
 
         root = np.kron(np.eye(n_p + 1), _square_root(problem.output_weight))
         self.weighted_theta = root @ self.theta
@@ -150,11 +151,13 @@ class CondensedQP:
         H = 2 * (self.weighted_theta.T @ self.weighted_theta + self.R)
         self.H = (H + H.T) / 2
 
-        # Affine maps of p = (x, u_prev, d_u, d_y, 1, r), for a previewed reference.
-        ones, inputs = np.tile(np.eye(l), (n_p + 1, 1)), step.reshape(-1, m)
-        none = np.zeros(((n_p + 1) * l, ones.shape[0]))
-        offset = np.tile(model.y_op, n_p + 1) - inputs @ model.u_op
-        free = np.hstack([np.concatenate(observed), inputs, inputs, ones, offset[:, None], none])
+        # Affine maps of p = (x, u_prev, d_u, d_y, v, 1, r), for a previewed reference.
+        responses = step.reshape(-1, model.B.shape[1])
+        inputs, measured = responses[:, :m], responses[:, m:]
+        ones = np.tile(np.eye(l), (n_p + 1, 1))
+        none = np.zeros(((n_p + 1) * l, len(ones)))
+        offset = (np.tile(model.y_op, n_p + 1) - responses @ model.all_inputs_op)[:, None]
+        free = np.hstack([np.concatenate(observed), inputs, inputs, ones, measured, offset, none])
         self._one_at = free.shape[1] - len(none) - 1
         error = -free
         error[:, self._one_at + 1 :] = np.eye(len(none))
@@ -181,7 +184,8 @@ class CondensedQP:
             upper=upper,
         )
         self._constant_map = self._with_constant_reference(self._preview_map)
-        self._undisturbed = np.repeat([0.0, 1.0], [m + l, 1])  # (d_u, d_y, 1)
+        self._undisturbed: tuple[Array, Array, Array] = np.zeros(m), np.zeros(l), model.v_op
+        self._one = np.ones(1)
 
     def _build_program(self, free: Array, u_previous: Array) -> tuple[Array, Array]:
         """The program, and its bounds as affine maps.
@@ -249,34 +253,31 @@ class CondensedQP:
         )
         return np.hstack([preview_map[:, :reference], constant])
 
-    def instance(
+    def parameter(
         self,
         x: Array,
         u_previous: Array,
         reference: Array,
-        output_disturbance: Array | None = None,
-        input_disturbance: Array | None = None,
-    ) -> Instance:
-        """The data of one sample; the reference has shape (l,) or (np + 1, l)."""
-        disturbances = self._undisturbed
-        if output_disturbance is not None or input_disturbance is not None:
-            disturbances = disturbances.copy()
-            m = len(u_previous)
-            try:
-                if input_disturbance is not None:
-                    disturbances[:m] = input_disturbance
-                if output_disturbance is not None:
-                    disturbances[m:-1] = output_disturbance
-            except (TypeError, ValueError) as error:
-                raise MampcError(
-                    f"disturbances: expected {m} at the inputs, {len(disturbances) - m - 1} at the outputs, "
-                    f"received others: {error}"
-                ) from None
-        if reference.ndim == 1:
-            data = self._constant_map.dot(np.concatenate((x, u_previous, disturbances, reference)))
-        else:
-            data = self._preview_map.dot(np.concatenate((x, u_previous, disturbances, reference.ravel())))
-        return Instance(data, self.parts, u_previous)
+        output_disturbance: Any = None,
+        input_disturbance: Any = None,
+        measured_disturbance: Any = None,
+    ) -> Array:
+        """p for one sample; the reference has shape (l,) or (np + 1, l), each disturbance may be left out."""
+        d_u, d_y, v = self._undisturbed
+        if input_disturbance is not None:
+            d_u = _shaped("input_disturbance", input_disturbance, d_u.shape)
+        if output_disturbance is not None:
+            d_y = _shaped("output_disturbance", output_disturbance, d_y.shape)
+        if measured_disturbance is not None:
+            v = _shaped("measured_disturbance", measured_disturbance, v.shape)
+        if reference.ndim == 2:
+            reference = reference.ravel()
+        return np.concatenate((x, u_previous, d_u, d_y, v, self._one, reference))
+
+    def instance(self, parameter: Array, u_previous: Array) -> Instance:
+        """The data of one sample, from its `parameter`."""
+        maps = self._constant_map if len(parameter) == self._constant_map.shape[1] else self._preview_map
+        return Instance(maps.dot(parameter), self.parts, u_previous)
 
     def cost(self, instance: Instance, moves: Array) -> float:
         """Tracking cost plus move weights plus output-limit penalty of the moves d, shape (n_moves,)."""
@@ -319,8 +320,16 @@ class CondensedQP:
         model = self.problem.model
         n, m = model.n_states, model.n_inputs
         feedback = self._preview_map[self.parts.moves][:m, : n + m]
-        open_loop = np.block([[model.A, model.B], [np.zeros((m, n)), np.eye(m)]])
-        return np.linalg.eigvals(open_loop + np.vstack([model.B, np.eye(m)]) @ feedback).astype(complex)
+        B = model.B[:, :m]
+        open_loop = np.block([[model.A, B], [np.zeros((m, n)), np.eye(m)]])
+        return np.linalg.eigvals(open_loop + np.vstack([B, np.eye(m)]) @ feedback).astype(complex)
+
+
+def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    array: Array = np.asarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
+    return array
 
 
 def _stacked(**maps: Array) -> tuple[Array, Parts]:

@@ -6,7 +6,7 @@ estimated with the state, remove steady offset under any constant model error or
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,7 +82,7 @@ class KalmanFilter:
         wander = _positive("drift", drift, d) * (1.0 if at_output else 1 / size)
         from scipy.linalg import solve_discrete_are
 
-        driven = model.B * excitation
+        driven = model.B[:, :m] * excitation
         Q = np.zeros((n + d, n + d))
         Q[:n, :n] = driven @ driven.T + 1e-10 * np.trace(driven @ driven.T) * np.eye(n)
         Q[n:, n:] = np.diag(wander**2)
@@ -96,36 +96,44 @@ class KalmanFilter:
         gain = np.linalg.solve(C @ P @ C.T + R, C @ P).T
         return cls(model, disturbance, gain)
 
-    def initial(self, u: Array, y: Any = None) -> Estimate:
-        """At rest under inputs u (m,); with measurements y (l,) the output disturbance explains them."""
+    def initial(self, u: Array, y: Any = None, v: Array | None = None) -> Estimate:
+        """At rest under inputs u (m,) and measured disturbances v (d,), default those of the operating
+        point; with measurements y (l,) the output disturbance explains them.
+        """
         model = self.model
-        x = model.steady_state(u)
-        d = np.zeros(model.n_outputs)
-        if y is not None and self.kind == "output":
-            d = as_vector("y", y, model.n_outputs) - self._output(x, u, d)
-        return Estimate(x, d, np.zeros(model.n_inputs))
+        none = Estimate(np.zeros(model.n_states), np.zeros(model.n_outputs), np.zeros(model.n_inputs))
+        inputs = np.concatenate([u, model.v_op if v is None else v])
+        rest = replace(none, x=model.steady_state(inputs))
+        if y is None or self.kind != "output":
+            return rest
+        unexplained = as_vector("y", y, model.n_outputs) - self._output(rest, self._change(rest, u, v))
+        return replace(rest, output_disturbance=unexplained)
 
-    def predict(self, last: Estimate, u: Array) -> Estimate:
-        """One sample on, with the inputs u (m,) applied since; disturbances stay."""
-        model = self.model
-        x = model.A @ last.x + model.B @ (u - model.u_op + last.input_disturbance)
+    def predict(self, last: Estimate, u: Array, v: Array | None = None) -> Estimate:
+        """One sample on, with the inputs u (m,) and disturbances v (d,) since; what is estimated stays."""
+        x = self.model.A @ last.x + self.model.B @ self._change(last, u, v)
         return Estimate(x, last.output_disturbance, last.input_disturbance)
 
-    def correct(self, predicted: Estimate, u: Array, y: Array) -> Estimate:
+    def correct(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Estimate:
         """Correct with measurements y (l,), taken just before the inputs u (m,) are replaced."""
-        innovation = y - self._output(
-            predicted.x, u + predicted.input_disturbance, predicted.output_disturbance
-        )
-        correction = self.gain @ innovation
+        correction = self.gain @ (y - self._output(predicted, self._change(predicted, u, v)))
         n = self.model.n_states
         x = predicted.x + correction[:n]
         if self.kind == "output":
             return Estimate(x, predicted.output_disturbance + correction[n:], predicted.input_disturbance)
         return Estimate(x, predicted.output_disturbance, predicted.input_disturbance + correction[n:])
 
-    def _output(self, x: Array, u: Array, disturbance: Array) -> Array:
+    def _change(self, estimate: Estimate, u: Array, v: Array | None) -> Array:
+        """All inputs of the model as differences from the operating point, shape (m + d,)."""
         model = self.model
-        y: Array = model.y_op + model.C @ x + model.D @ (u - model.u_op) + disturbance
+        du = u - model.u_op + estimate.input_disturbance
+        if model.n_disturbances == 0:
+            return du
+        return np.concatenate([du, np.zeros(model.n_disturbances) if v is None else v - model.v_op])
+
+    def _output(self, estimate: Estimate, change: Array) -> Array:
+        model = self.model
+        y: Array = model.y_op + model.C @ estimate.x + model.D @ change + estimate.output_disturbance
         return y
 
 
@@ -135,8 +143,8 @@ def _augmented(model: StateSpace, at_output: bool) -> tuple[Array, Array]:
     if at_output:
         A = np.block([[model.A, np.zeros((n, l))], [np.zeros((l, n)), np.eye(l)]])
         return A, np.hstack([model.C, np.eye(l)])
-    A = np.block([[model.A, model.B], [np.zeros((m, n)), np.eye(m)]])
-    return A, np.hstack([model.C, model.D])
+    A = np.block([[model.A, model.B[:, :m]], [np.zeros((m, n)), np.eye(m)]])
+    return A, np.hstack([model.C, model.D[:, :m]])
 
 
 def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
@@ -160,7 +168,7 @@ def _gain_size(model: StateSpace) -> float:
         gain = model.dc_gain()
     except MampcError:
         gain = np.sum([model.C @ np.linalg.matrix_power(model.A, k) @ model.B for k in range(100)], axis=0)
-    return float(np.sqrt(np.mean(gain**2))) or 1.0
+    return float(np.sqrt(np.mean(gain[:, : model.n_inputs] ** 2))) or 1.0
 
 
 def _positive(name: str, value: Any, size: int) -> Array:

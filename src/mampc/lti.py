@@ -3,13 +3,15 @@
     x+ = A x + B (u - u_op)          (or dx/dt = ... in continuous time, dt = 0)
     y  = y_op + C x + D (u - u_op)
 
-u and y are in engineering units; x is the deviation from the state at the operating point.
+u and y are in engineering units; x is the deviation from the state at the operating point. Measured
+disturbances v, such as a load, are further inputs that no controller manipulates: their columns stand behind
+those of u in B and D.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,10 +29,11 @@ class StateSpace:
     """A linear model with its sample time, operating point and names.
 
     Args:
-        A, B, C, D: shapes (n, n), (n, m), (l, n), (l, m); D = None means zeros.
+        A, B, C, D: shapes (n, n), (n, m + d), (l, n), (l, m + d); D = None means zeros.
         dt: sample time in seconds, 0 for continuous time.
         u_op, y_op: operating point in engineering units, shapes (m,), (l,); default zeros.
-        names: signal names; default u1.., y1.., x1...
+        names: signal names; default u1.., y1.., x1.., and no measured disturbances (d = 0).
+        v_op: measured disturbances at the operating point, shape (d,); default zeros.
 
     Raises:
         MampcError: shapes that do not fit together, non-finite numbers, a negative dt.
@@ -41,9 +44,10 @@ class StateSpace:
     C: Array
     D: Array
     dt: float
-    u_op: Array = None  # type: ignore[assignment]  # always set after construction, as are the next two
+    u_op: Array = None  # type: ignore[assignment]  # always set after construction, as are the others
     y_op: Array = None  # type: ignore[assignment]
     names: Names = None  # type: ignore[assignment]
+    v_op: Array = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         A = as_matrix("A", self.A)
@@ -51,11 +55,13 @@ class StateSpace:
         A = as_matrix("A", A, n, n)
         B = as_matrix("B", self.B, n)
         C = as_matrix("C", self.C, None, n)
-        m, l = B.shape[1], C.shape[0]
-        if m == 0 or l == 0:
+        columns, l = B.shape[1], C.shape[0]
+        names = Names.numbered(columns, l, n) if self.names is None else self.names
+        d = len(names.disturbances)
+        m = columns - d
+        if m <= 0 or l == 0:
             raise MampcError(f"StateSpace: expected at least one input and output, received {m} and {l}")
-        D = np.zeros((l, m)) if self.D is None else as_matrix("D", self.D, l, m)
-        names = Names.numbered(m, l, n) if self.names is None else self.names
+        D = np.zeros((l, columns)) if self.D is None else as_matrix("D", self.D, l, columns)
         if not names.states:
             names = replace(names, states=Names.numbered(m, l, n).states)
         require_count("names.inputs", names.inputs, m)
@@ -66,6 +72,7 @@ class StateSpace:
             "dt": as_number("dt", self.dt, 0.0),
             "u_op": as_vector("u_op", 0.0 if self.u_op is None else self.u_op, m),
             "y_op": as_vector("y_op", 0.0 if self.y_op is None else self.y_op, l),
+            "v_op": as_vector("v_op", 0.0 if self.v_op is None else self.v_op, d),
         }  # fmt: skip
         for name, value in checked.items():
             if isinstance(value, np.ndarray):
@@ -78,7 +85,18 @@ class StateSpace:
 
     @property
     def n_inputs(self) -> int:
-        return int(self.B.shape[1])
+        """m, the manipulated inputs."""
+        return len(self.names.inputs)
+
+    @property
+    def n_disturbances(self) -> int:
+        """d, the measured disturbances."""
+        return len(self.names.disturbances)
+
+    @property
+    def all_inputs_op(self) -> Array:
+        """Inputs and measured disturbances at the operating point, shape (m + d,)."""
+        return np.concatenate([self.u_op, self.v_op])
 
     @property
     def n_outputs(self) -> int:
@@ -125,7 +143,7 @@ class StateSpace:
             raise MampcError(f"zeros: expected as many inputs as outputs, received {m} and {l}")
         from scipy.linalg import eig
 
-        system = np.block([[self.A, self.B], [self.C, self.D]])
+        system = np.block([[self.A, self.B[:, :m]], [self.C, self.D[:, :m]]])
         pencil = np.diag(np.repeat([1.0, 0.0], [n, m]))
         alpha, beta = eig(system, pencil, right=False, homogeneous_eigvals=True)
         finite = np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), 1e-300)
@@ -144,30 +162,35 @@ class StateSpace:
             raise MampcError(f"discretise: expected a continuous model (dt = 0), received dt = {self.dt:g} s")
         from scipy.linalg import expm
 
-        n, m = self.n_states, self.n_inputs
+        n, m = self.B.shape
         block = np.zeros((n + m, n + m))
         block[:n, :n], block[:n, n:] = self.A, self.B
         held = expm(block * as_number("dt", dt, 0.0, exclusive=True))
         return replace(self, A=held[:n, :n], B=held[:n, n:], dt=dt)
 
     def steady_state(self, u: Any) -> Array:
-        """Deviation state x, shape (n,), at rest under constant inputs u, shape (m,), in units of u.
+        """Deviation state x, shape (n,), at rest under constant inputs u, shape (m,) or (m + d,).
 
-        For an integrating model the least-norm solution; at u = u_op always zeros.
+        For an integrating model the least-norm solution; at the operating point always zeros. Measured
+        disturbances left out are those of the operating point.
         """
+        inputs = as_array("u", u)
+        if inputs.shape == self.u_op.shape:
+            inputs = np.concatenate([inputs, self.v_op])
+        change = as_vector("u", inputs, self.B.shape[1]) - self.all_inputs_op
         shift = np.eye(self.n_states) if self.is_discrete else np.zeros((self.n_states, self.n_states))
-        x: Array = np.linalg.lstsq(shift - self.A, self.B @ (as_vector("u", u, self.n_inputs) - self.u_op))[0]
+        x: Array = np.linalg.lstsq(shift - self.A, self.B @ change)[0]
         return x
 
     def response(self, u: Any, x0: Any = None) -> Array:
-        """Outputs, shape (N, l), to the inputs u, shape (N, m), from the state x0 (default: at rest).
+        """Outputs, shape (N, l), to the inputs u, shape (N, m + d), from the state x0 (default: at rest).
 
         Raises:
             MampcError: a continuous model, or inputs of another width.
         """
         if not self.is_discrete:
             raise MampcError("response: expected a discrete model, received dt = 0; discretise it first")
-        du = as_matrix("u", u, None, self.n_inputs) - self.u_op
+        du = as_matrix("u", u, None, self.B.shape[1]) - self.all_inputs_op
         x = np.zeros(self.n_states) if x0 is None else as_vector("x0", x0, self.n_states)
         drive, states = du @ self.B.T, np.empty((len(du), self.n_states))
         for k in range(len(du)):
@@ -213,11 +236,12 @@ class StateSpace:
 
     def save(self, path: str | Path) -> None:
         """Write the model as JSON, whole or not at all; `load` gives the same numbers back."""
+        arrays = ("A", "B", "C", "D", "u_op", "y_op", "v_op")
         content = {
             "format": "mampc-model-1",
             "dt": self.dt,
-            **{k: np.asarray(getattr(self, k)).tolist() for k in ("A", "B", "C", "D", "u_op", "y_op")},
-            "names": {k: list(getattr(self.names, k)) for k in ("inputs", "outputs", "states")},
+            **{k: np.asarray(getattr(self, k)).tolist() for k in arrays},
+            "names": {k: list(names) for k, names in asdict(self.names).items()},
         }
         target = Path(path)
         partial = target.with_name(f".{target.name}.partial")
@@ -241,7 +265,7 @@ class StateSpace:
         try:
             names = Names(**{k: tuple(v) for k, v in content["names"].items()})
             matrices = {k: content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")}
-            return cls(**matrices, names=names)
+            return cls(**matrices, names=names, v_op=content.get("v_op", 0.0))
         except (KeyError, TypeError, AttributeError) as error:
             raise MampcError(f"{path}: expected A, B, C, D, dt, u_op, y_op, names; {error!r}") from None
         except MampcError as error:
@@ -262,11 +286,20 @@ def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
     Jacobians by central differences with steps of 1e-6 of each variable's size.
 
     Args:
-        plant: with `derivative`, `output`, `steady_state`; its `names` and `u_op` are used if it has them.
-        u: inputs at the operating point, shape (m,); default the plant's `u_op`.
+        plant: with `derivative`, `output`, `steady_state`; its `names`, `u_op` and `v_op` (measured
+            disturbances) are used if it has them.
+        u: inputs at the operating point, shape (m,) or (m + d,); default the plant's.
     """
-    u_op = as_array("u", getattr(plant, "u_op", None) if u is None else u)
-    x_op = as_array("steady_state", plant.steady_state(u_op))
+    given = getattr(plant, "u_op", None) if u is None else u
+    if given is None:
+        raise MampcError(f"linearise: expected inputs u, since {type(plant).__name__} has no u_op")
+    inputs = as_array("u", given)
+    names: Names | None = getattr(plant, "names", None)
+    m = len(inputs) if names is None else len(names.inputs)
+    if names is not None and len(inputs) == m:
+        inputs = np.concatenate([inputs, as_array("v_op", getattr(plant, "v_op", ()))])
+        names = names if len(inputs) > m else replace(names, disturbances=())
+    x_op = as_array("steady_state", plant.steady_state(inputs))
 
     def jacobian(function: Any, point: Array) -> Array:
         columns = []
@@ -277,14 +310,15 @@ def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
         return np.stack(columns, axis=-1)
 
     return StateSpace(
-        A=jacobian(lambda x: plant.derivative(x, u_op), x_op),
-        B=jacobian(lambda v: plant.derivative(x_op, v), u_op),
-        C=jacobian(lambda x: plant.output(x, u_op), x_op),
-        D=jacobian(lambda v: plant.output(x_op, v), u_op),
+        A=jacobian(lambda x: plant.derivative(x, inputs), x_op),
+        B=jacobian(lambda v: plant.derivative(x_op, v), inputs),
+        C=jacobian(lambda x: plant.output(x, inputs), x_op),
+        D=jacobian(lambda v: plant.output(x_op, v), inputs),
         dt=0.0,
-        u_op=u_op,
-        y_op=plant.output(x_op, u_op),
-        names=getattr(plant, "names", None),  # type: ignore[arg-type]
+        u_op=inputs[:m],
+        y_op=plant.output(x_op, inputs),
+        names=names,  # type: ignore[arg-type]
+        v_op=inputs[m:],
     )
 
 

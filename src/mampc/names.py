@@ -12,7 +12,8 @@ from mampc.errors import MampcError
 class Names:
     """Names of the inputs, outputs and states of a plant or model, each a tuple of distinct words.
 
-    `disturbances` are inputs of a plant that are measured but not manipulated.
+    `disturbances` are inputs that are measured and not manipulated, such as a load; where inputs and
+    disturbances stand together in one array, the inputs come first.
     """
 
     inputs: tuple[str, ...]
@@ -28,6 +29,9 @@ class Names:
             if len(set(names)) != len(names):
                 raise MampcError(f"names.{kind}: expected distinct names, received {names!r}")
             object.__setattr__(self, kind, names)
+        shared = set(self.inputs) & set(self.disturbances)
+        if shared:
+            raise MampcError(f"names: expected inputs and disturbances to differ, received {shared} in both")
 
     @classmethod
     def numbered(cls, inputs: int, outputs: int, states: int = 0) -> Names:

@@ -19,12 +19,6 @@ from mampc.arrays import Array
 from mampc.errors import MampcError
 
 UNBOUNDED = 1e30  # what stands for infinity in bounds
-LARGEST = 1e150  # sizes whose products are still numbers
-
-
-def is_usable(vector: Array) -> bool:
-    """Whether all entries, one at least, are numbers of a size to calculate with; never warns."""
-    return bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
 
 
 class QPStatus(Enum):

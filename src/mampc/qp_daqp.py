@@ -13,7 +13,7 @@ import numpy as np
 
 from mampc.arrays import Array
 from mampc.errors import MampcError
-from mampc.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram, is_usable
+from mampc.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram
 
 _STATUS = {
     1: QPStatus.OPTIMAL,
@@ -57,7 +57,7 @@ class DaqpSolver:
     def solve(self, f: Array, lower: Array, upper: Array) -> QPSolution:
         """Minimise for the linear term f, shape (n,), and bounds, shape (n_simple + rows,).
 
-        An f that `is_usable` refuses, not-a-number bounds and lower > upper give the status BAD_DATA.
+        Non-finite f, not-a-number bounds and lower > upper give the status BAD_DATA.
 
         Raises:
             MampcError: wrong shapes.
@@ -68,7 +68,7 @@ class DaqpSolver:
                 f"received {f.shape}, {lower.shape}, {upper.shape}"
             )
         # lower <= upper is false for not-a-number too.
-        if not (is_usable(f) and (lower <= upper).all()):
+        if not (np.isfinite(f).all() and (lower <= upper).all()):
             return _BAD_DATA
         model = getattr(self._local, "model", None)
         if model is None:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array
+from mampc.arrays import Array, as_vector, is_usable
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.errors import MampcError
 from mampc.estimation import Estimate, KalmanFilter
-from mampc.qp import is_usable
+from mampc.lti import StateSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +22,7 @@ class RegulatorState:
 
     controller: ControllerState
     estimate: Estimate
+    measured_disturbance: Array  # shape (d,), as last told
 
 
 class Regulator:
@@ -44,69 +45,95 @@ class Regulator:
         self.controller = controller
         self._y_shape = (model.n_outputs,)
         self.estimator = KalmanFilter.offset_free(model) if estimator is None else estimator
-        received = self.estimator.model
-        if (received.n_states, received.n_inputs, received.n_outputs) != (
-            model.n_states,
-            model.n_inputs,
-            model.n_outputs,
-        ):
-            raise MampcError(
-                f"estimator: expected {model.n_states} states, {model.n_inputs} inputs, {model.n_outputs} "
-                f"outputs, received {received.n_states}, {received.n_inputs}, {received.n_outputs}"
-            )
+        self._v_shape = (model.n_disturbances,)
+        expected, received = _sizes(model), _sizes(self.estimator.model)
+        if received != expected:
+            raise MampcError(f"estimator: expected a model with {expected}, received {received}")
 
-    def initial_state(self, u_previous: Any = None, y: Any = None) -> RegulatorState:
+    def initial_state(
+        self, u_previous: Any = None, y: Any = None, measured_disturbance: Any = None
+    ) -> RegulatorState:
         """At rest under the inputs applied so far.
 
         Args:
             u_previous: shape (m,) or (h, m), latest last; default the operating point.
             y: measurements at that rest, shape (l,); the estimator takes what the model does not
                 explain for a constant disturbance, so that the first step has no jump.
+            measured_disturbance: at that rest, shape (d,); default the operating point.
         """
         controller = self.controller.initial_state(u_previous)
-        return RegulatorState(controller, self.estimator.initial(controller.inputs[-1], y))
+        v = self.controller.problem.model.v_op
+        if measured_disturbance is not None:
+            v = as_vector("measured_disturbance", measured_disturbance, len(v))
+        return RegulatorState(controller, self.estimator.initial(controller.inputs[-1], y, v), v)
 
-    def step(self, state: RegulatorState, y: Any, reference: Any, *, u_applied: Any = None) -> Decision:
+    def step(
+        self,
+        state: RegulatorState,
+        y: Any,
+        reference: Any,
+        *,
+        u_applied: Any = None,
+        measured_disturbance: Any = None,
+    ) -> Decision:
         """Decide the inputs of this sample from its measurements.
 
         Args:
             state: from `initial_state` or the previous decision.
-            y: measured outputs, shape (l,); numbers that are not finite lead to a held input.
+            y: measured outputs, shape (l,); numbers that are not usable lead to a held input.
             reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
             u_applied: what the plant really got since the last step, shape (m,), if not what was decided.
+            measured_disturbance: now, shape (d,), in engineering units; predicted to stay as it is.
+                Left out or not usable, the last one holds on.
 
         Raises:
             MampcError: arrays of the wrong shape.
         """
         start = perf_counter()
-        y = np.asarray(y, dtype=np.float64)
-        if y.shape != self._y_shape:
-            raise MampcError(f"y: expected shape {self._y_shape}, received {y.shape}")
-        memory = state.controller
+        y = self._shaped("y", y, self._y_shape)
+        memory, v_last = state.controller, state.measured_disturbance
         if u_applied is not None:
             memory = self._applied(memory, u_applied)
+        v = v_last
+        if measured_disturbance is not None:
+            told = self._shaped("measured_disturbance", measured_disturbance, self._v_shape)
+            v = told if len(told) and is_usable(told) else v_last
         u_previous = memory.inputs[-1]
-        estimate = self.estimator.predict(state.estimate, u_previous)
+        estimate = self.estimator.predict(state.estimate, u_previous, v_last)
         usable = is_usable(y)
         if usable:
-            estimate = self.estimator.correct(estimate, u_previous, y)
+            estimate = self.estimator.correct(estimate, u_previous, y, v_last)
         decision = self.controller.step(
             memory,
             estimate.x if usable else np.full_like(estimate.x, np.nan),  # without a measurement: hold
             reference,
             output_disturbance=estimate.output_disturbance,
             input_disturbance=estimate.input_disturbance,
+            measured_disturbance=v,
         )
         return replace(
             decision,
-            state=RegulatorState(decision.state, estimate),
+            state=RegulatorState(decision.state, estimate, v),
             solve_time=perf_counter() - start,
         )
 
+    @staticmethod
+    def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+        array: Array = np.asarray(value, dtype=np.float64)
+        if array.shape != shape:
+            raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
+        return array
+
     def _applied(self, memory: ControllerState, u_applied: Any) -> ControllerState:
-        u: Array = np.asarray(u_applied, dtype=np.float64)
-        if u.shape != memory.inputs[-1].shape:
-            raise MampcError(f"u_applied: expected shape {memory.inputs[-1].shape}, received {u.shape}")
-        if not np.isfinite(u).all():
+        """The memory with the latest inputs put right; not-usable numbers change nothing."""
+        u = self._shaped("u_applied", u_applied, memory.inputs[-1].shape)
+        if not is_usable(u):
             return memory
         return replace(memory, inputs=np.concatenate([memory.inputs[:-1], u[None]]))
+
+
+def _sizes(model: StateSpace) -> str:
+    return (
+        f"{model.n_states} states, {model.n_inputs} inputs, {model.n_outputs} outputs, "
+        f"{model.n_disturbances} measured disturbances"
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,8 @@ class Run:
         r: reference, shape (T, l).
         u_initial: inputs before the first sample, shape (m,).
         decisions: the regulator's decisions, with their states left out.
+        v: measured disturbances, shape (T, d).
+        faults: sample -> what took the plant out of its range there (see `Plant`); empty if nothing did.
         dt: sample time in seconds.
         names: of the inputs and outputs.
     """
@@ -50,6 +52,8 @@ class Run:
     decisions: tuple[Decision, ...] = field(repr=False)
     dt: float
     names: Names
+    v: Array
+    faults: dict[int, tuple[str, ...]]
 
     def metrics(self, *, threshold: float = 0.1, skip: int = 0) -> Metrics:
         """How often the inputs move and how well the outputs follow; see `Metrics`."""
@@ -74,14 +78,14 @@ class Run:
         return closed_loop_figure(self.t, self.u, self.y, self.r, self.names)
 
     def to_csv(self, path: str | Path) -> None:
-        """Write time, inputs, outputs, measured outputs, references and status, in full precision."""
+        """Write time, inputs, measured disturbances, outputs, references and status, in full precision."""
         inputs, outputs = self.names.inputs, self.names.outputs
         header = [
-            "time", *inputs, *outputs,
+            "time", *inputs, *self.names.disturbances, *outputs,
             *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
             "status", "objective", "iterations", "solve_time_us",
         ]  # fmt: skip
-        numbers = np.hstack([self.t[:, None], self.u, self.y, self.y_measured, self.r]).tolist()
+        numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
         target = Path(path)
         unfinished = target.with_name(f".{target.name}.partial")
         with unfinished.open("w", newline="", encoding="utf-8") as file:
@@ -105,6 +109,7 @@ def simulate(
     preview: bool = False,
     input_disturbance: Any = None,
     output_disturbance: Any = None,
+    measured_disturbance: Any = None,
     u_initial: Any = None,
     progress: bool | None = None,
 ) -> Run:
@@ -120,6 +125,8 @@ def simulate(
         preview: let the regulator see the reference over its prediction horizon.
         input_disturbance: unmeasured, added to the inputs on their way to the plant, (m,) or (T, m).
         output_disturbance: unmeasured, added to the true outputs, (l,) or (T, l).
+        measured_disturbance: of the plant, and told to the regulator if its model has it, (d,) or (T, d);
+            default the plant's usual ones (its `v_op`).
         u_initial: inputs at the start, shape (m,); default the plant's usual ones (its `u_op`).
         progress: show a progress bar on the terminal; default: when the run is long.
 
@@ -127,12 +134,11 @@ def simulate(
         MampcError: arguments that do not fit together, or a plant that cannot be integrated.
     """
     model = regulator.controller.problem.model
-    m, l = model.n_inputs, model.n_outputs
-    names = plant.names
-    if (len(names.inputs), len(names.outputs)) != (m, l):
+    m, l, d = model.n_inputs, model.n_outputs, len(plant.names.disturbances)
+    if (len(plant.names.inputs), len(plant.names.outputs)) != (m, l) or model.n_disturbances not in (0, d):
         raise MampcError(
-            f"simulate: expected a plant with {m} inputs and {l} outputs, "
-            f"received {len(names.inputs)} and {len(names.outputs)}"
+            f"simulate: expected a plant with {m} inputs, {l} outputs and {model.n_disturbances} measured "
+            f"disturbances, received {len(plant.names.inputs)}, {len(plant.names.outputs)} and {d}"
         )
     r = _trajectory("reference", reference, l, steps)
     T = len(r)
@@ -140,45 +146,54 @@ def simulate(
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
     wobble = spread * np.random.default_rng(seed).standard_normal((T, l))
-    at_inputs = _trajectory(
-        "input_disturbance", 0.0 if input_disturbance is None else input_disturbance, m, T
-    )
-    at_outputs = _trajectory(
-        "output_disturbance", 0.0 if output_disturbance is None else output_disturbance, l, T
-    )
-    usual = getattr(plant, "u_op", None)
-    if u_initial is None:
-        u_initial = model.u_op if usual is None else usual
-    u = as_vector("u_initial", u_initial, m)
+    at_inputs = _trajectory("input_disturbance", _default(input_disturbance, 0.0), m, T)
+    at_outputs = _trajectory("output_disturbance", _default(output_disturbance, 0.0), l, T)
+    usual = getattr(plant, "v_op", np.zeros(d))
+    v = _trajectory("measured_disturbance", _default(measured_disturbance, usual), d, T)
+    start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
 
-    x = plant.steady_state(u)
-    output, move = _sampled(plant, model.dt)
-    state = regulator.initial_state(u, output(x, u))
+    output, move, faults = _sampled(plant, model.dt)
+    x = plant.steady_state(np.concatenate([start, v[0]]))
+    told: list[dict[str, Any]] = [{"measured_disturbance": now} if model.n_disturbances else {} for now in v]
+    y = output(x, np.concatenate([start, v[0]]))
+    state = regulator.initial_state(start, y, **told[0])
     horizon = regulator.controller.problem.prediction_horizon
-    inputs, outputs, decisions = np.empty((T, m)), np.empty((T, l)), []
-    start = u
+    inputs, outputs, decisions, found = np.empty((T, m)), np.empty((T, l)), [], {}
+    u = start
     for k in _watched(T, progress):
-        outputs[k] = output(x, u + at_inputs[k]) + at_outputs[k]
+        outputs[k] = output(x, np.concatenate([u + at_inputs[k], v[k]])) + at_outputs[k]
         ahead = r[np.minimum(np.arange(k, k + horizon + 1), T - 1)] if preview else r[k]
-        decision = regulator.step(state, outputs[k] + wobble[k], ahead)
+        decision = regulator.step(state, outputs[k] + wobble[k], ahead, **told[k])
         state, u = decision.state, decision.u
         inputs[k] = u
-        decisions.append(_without_state(decision))
-        x = move(x, u + at_inputs[k])
+        decisions.append(replace(decision, state=None))
+        x = move(x, np.concatenate([u + at_inputs[k], v[k]]))
+        wrong = faults(x, np.concatenate([u + at_inputs[k], v[k]]))
+        if wrong:
+            found[k] = wrong
     return Run(
         t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + wobble, r=r, u_initial=start,
-        decisions=tuple(decisions), dt=model.dt, names=names,
+        decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found,
     )  # fmt: skip
 
 
-def _sampled(plant: Plant | StateSpace, dt: float) -> tuple[Any, Any]:
-    """The plant's output and its motion over one sample."""
+def _default(value: Any, otherwise: Any) -> Any:
+    return otherwise if value is None else value
+
+
+def _sampled(plant: Plant | StateSpace, dt: float) -> tuple[Any, Any, Any]:
+    """The plant's output, its motion over one sample, and what is wrong with it."""
     if not isinstance(plant, StateSpace):
-        return plant.output, lambda x, u: advance(plant, x, u, dt)
+        faults = getattr(plant, "faults", lambda x, u: ())
+        return plant.output, lambda x, u: advance(plant, x, u, dt), faults
     if not np.isclose(plant.dt, dt, rtol=1e-6):
         raise MampcError(f"simulate: expected a plant sampled every {dt:g} s, received {plant.dt:g} s")
-    A, B, C, D, u_op, y_op = plant.A, plant.B, plant.C, plant.D, plant.u_op, plant.y_op
-    return lambda x, u: y_op + C @ x + D @ (u - u_op), lambda x, u: A @ x + B @ (u - u_op)
+    A, B, C, D, op, y_op = plant.A, plant.B, plant.C, plant.D, plant.all_inputs_op, plant.y_op
+    return (
+        lambda x, u: y_op + C @ x + D @ (u - op),
+        lambda x, u: A @ x + B @ (u - op),
+        lambda x, u: (),
+    )
 
 
 def _trajectory(name: str, value: Any, width: int, steps: int | None) -> Array:
@@ -193,12 +208,6 @@ def _trajectory(name: str, value: Any, width: int, steps: int | None) -> Array:
     if len(rows) == 0:
         raise MampcError(f"{name}: expected at least one row, received none")
     return rows[np.minimum(np.arange(steps), len(rows) - 1)]
-
-
-def _without_state(decision: Decision) -> Decision:
-    from dataclasses import replace
-
-    return replace(decision, state=None)
 
 
 def _watched(steps: int, progress: bool | None) -> Any:

@@ -25,7 +25,7 @@ from mampc.controllers.decision import ControllerState, Status
 from mampc.controllers.pattern_solver import PatternSolver
 from mampc.errors import MampcError
 from mampc.patterns import MoveRules
-from mampc.qp import QPStatus, QuadraticProgram, is_usable
+from mampc.qp import QPStatus, QuadraticProgram
 from mampc.qp_daqp import DaqpSolver
 
 HIGHEST_PENALTY = 1e10  # a growing mu stops here: beyond it the first step loses its digits
@@ -82,8 +82,6 @@ class AlternatingSearch:
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """Algorithm 1 for one sample, from the guess that the last sample left (at first: v = 0)."""
-        if not is_usable(instance.f):
-            return Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
         settings, growth = self.settings, self.settings.penalty_growth
         threshold = self._threshold
         magnitude = threshold.magnitude(self.rules.past_changes(state.inputs))

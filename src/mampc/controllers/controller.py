@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.arrays import Array, as_array, as_vector
+from mampc.arrays import Array, as_array, as_vector, is_usable
 from mampc.condensing import CondensedQP, Instance
 from mampc.controllers.decision import ControllerState, Decision, Status
 from mampc.errors import MampcError
 from mampc.problem import TrackingProblem
-from mampc.qp import QPStatus, is_usable
+from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver
 
 HELD_BY = {
@@ -93,6 +93,7 @@ class Controller(ABC):
         *,
         output_disturbance: Array | None = None,
         input_disturbance: Array | None = None,
+        measured_disturbance: Array | None = None,
     ) -> Decision:
         """Decide the inputs of this sample.
 
@@ -102,9 +103,11 @@ class Controller(ABC):
             reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
             output_disturbance: added to every predicted output, shape (l,).
             input_disturbance: added to every input of the model, shape (m,).
+            measured_disturbance: the model's measured disturbances, taken to stay as they are, in
+                engineering units, shape (d,); default those of the operating point.
 
         Returns:
-            A `Decision`. Numbers that are not finite lead to a held input and a status, never to an error.
+            A `Decision`. Numbers that `is_usable` refuses lead to a held input and a status, not to an error.
 
         Raises:
             MampcError: arrays of the wrong shape.
@@ -118,9 +121,13 @@ class Controller(ABC):
             raise MampcError(
                 f"reference: expected shape {self._reference_shapes}, received {reference.shape}"
             )
-        instance = self.condensed.instance(
-            x, state.inputs[-1], reference, output_disturbance, input_disturbance
+        u_previous = state.inputs[-1]
+        parameter = self.condensed.parameter(
+            x, u_previous, reference, output_disturbance, input_disturbance, measured_disturbance
         )
+        if not is_usable(parameter):
+            return self._decide(Plan(None, Status.HELD_BAD_MEASUREMENT, 0), None, state, start)
+        instance = self.condensed.instance(parameter, u_previous)
         return self._decide(self._plan(instance, state), instance, state, start)
 
     @abstractmethod
@@ -131,10 +138,11 @@ class Controller(ABC):
         """What the moves cost beside the quadratic program."""
         return 0.0
 
-    def _decide(self, plan: Plan, instance: Instance, state: ControllerState, start: float) -> Decision:
+    def _decide(
+        self, plan: Plan, instance: Instance | None, state: ControllerState, start: float
+    ) -> Decision:
         moves, status, iterations, lower_bound, guess, inputs, objective = plan
-        u_previous = instance.u_previous
-        if moves is None:
+        if moves is None or instance is None:
             moves = np.zeros(self.condensed.n_moves)
             objective, lower_bound = np.nan, -np.inf
         elif objective is None:
@@ -143,7 +151,7 @@ class Controller(ABC):
             lower_bound = objective
         if inputs is None:
             inputs = self.condensed.cumulate @ moves
-            inputs.reshape(self._shape)[...] += u_previous
+            inputs.reshape(self._shape)[...] += state.inputs[-1]
             inputs = np.minimum(np.maximum(inputs.reshape(self._shape), self._u_min), self._u_max)
         else:
             inputs = inputs.reshape(self._shape)
@@ -157,16 +165,12 @@ class Controller(ABC):
     def _unrestricted(self, instance: Instance) -> Plan:
         """Plain MPC: every move is free. Where no limit is active the optimum is at hand already."""
         margins = instance.margins
-        # Inside by more than rounding; false for any not-a-number, which is looked at more closely below.
         if margins[margins.argmin()] > INSIDE:
             return Plan(
                 instance.unlimited_moves, Status.OPTIMAL, 0, None, None,
                 instance.unlimited_inputs, instance.unlimited_cost,
             )  # fmt: skip
-        f = instance.f
-        if not is_usable(f):
-            return Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
-        solution = self._solver.solve(f, instance.lower, instance.upper)
+        solution = self._solver.solve(instance.f, instance.lower, instance.upper)
         if solution.z is None:
             return Plan(None, HELD_BY[solution.status], solution.iterations)
         return Plan(solution.z[self.condensed.n_violations :], Status.OPTIMAL, solution.iterations, None)

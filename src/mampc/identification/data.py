@@ -21,9 +21,10 @@ CSV_FILE_LIMIT = 1 << 30  # bytes
 
 @dataclass(frozen=True, eq=False)
 class IOData:
-    """A record of inputs u (N, m) and outputs y (N, l), sampled together every dt seconds.
+    """A record of inputs u (N, m + d) and outputs y (N, l), sampled together every dt seconds.
 
-    y[k] is measured just as u[k] begins to act. Engineering units.
+    y[k] is measured just as u[k] begins to act. Engineering units. The last d inputs are measured
+    disturbances, if the names say so.
 
     Args:
         u, y: the record; one-dimensional arrays mean a single signal.
@@ -51,7 +52,7 @@ class IOData:
             )
         names = Names.numbered(u.shape[1], y.shape[1]) if self.names is None else self.names
         names = replace(names, states=())
-        require_count("names.inputs", names.inputs, u.shape[1])
+        require_count("names.inputs", names.inputs + names.disturbances, u.shape[1])
         require_count("names.outputs", names.outputs, y.shape[1])
         object.__setattr__(self, "u", u)
         object.__setattr__(self, "y", y)
@@ -80,20 +81,27 @@ class IOData:
         partial = target.with_name(f".{target.name}.partial")
         with partial.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["time", *self.names.inputs, *self.names.outputs])
+            writer.writerow(["time", *self.names.inputs, *self.names.disturbances, *self.names.outputs])
             time = np.arange(len(self))[:, None] * self.dt
             writer.writerows(np.hstack([time, self.u, self.y]).tolist())
         partial.replace(target)
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, *, inputs: Sequence[str], outputs: Sequence[str], dt: float | None = None
+        cls,
+        path: str | Path,
+        *,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        disturbances: Sequence[str] = (),
+        dt: float | None = None,
     ) -> IOData:
         """Read the named columns of a CSV file with a header row.
 
         Args:
             path: the file.
             inputs, outputs: column names.
+            disturbances: columns of inputs that are measured and not manipulated.
             dt: sample time in seconds; default from a column named `time`.
 
         Raises:
@@ -101,18 +109,21 @@ class IOData:
                 an uneven `time` column where dt is taken from it.
         """
         header, rows = _read_csv(Path(path))
-        inputs, outputs = tuple(inputs), tuple(outputs)
+        names = Names(tuple(inputs), tuple(outputs), disturbances=tuple(disturbances))
+        all_inputs = names.inputs + names.disturbances
         columns = {}
-        for name in (*inputs, *outputs, *(["time"] if dt is None else [])):
+        for name in (*all_inputs, *names.outputs, *(["time"] if dt is None else [])):
             if header.count(name) != 1:
                 hint = "; pass dt (--dt)" if name == "time" else ""
                 raise MampcError(f"{path}: expected one column {name!r}, received columns {header}{hint}")
             columns[name] = _numbers(Path(path), rows, header.index(name), name)
         if dt is None:
             dt = _even_step(path, columns["time"])
-        u = np.stack([columns[name] for name in inputs], axis=1) if inputs else np.empty((len(rows), 0))
-        y = np.stack([columns[name] for name in outputs], axis=1) if outputs else np.empty((len(rows), 0))
-        return cls(u, y, dt, Names(inputs, outputs))
+        u, y = (
+            np.array([columns[name] for name in group]).reshape(len(group), len(rows)).T
+            for group in (all_inputs, names.outputs)
+        )
+        return cls(u, y, dt, names)
 
 
 def excite(
@@ -128,7 +139,8 @@ def excite(
 
     Args:
         plant: nonlinear plant, or a discrete model.
-        u: inputs in engineering units, shape (N, m), each held for dt.
+        u: inputs in engineering units, each held for dt, shape (N, m), or (N, m + d) to move the plant's
+            measured disturbances too.
         dt: sample time in seconds (a discrete model has its own).
         noise: standard deviation of Gaussian measurement noise, scalar or (l,), in output units.
         seed: of the noise.
@@ -144,9 +156,11 @@ def excite(
             )
         dt = plant.dt
     dt = as_number("dt", dt, 0.0, exclusive=True)
-    m, l = len(plant.names.inputs), len(plant.names.outputs)
+    names, l = plant.names, len(plant.names.outputs)
     signal = _column("u", u)
-    signal = as_matrix("u", signal, None, m)
+    if signal.shape[1] == len(names.inputs) and not isinstance(plant, StateSpace):
+        names = replace(names, disturbances=())
+    signal = as_matrix("u", signal, None, len(names.inputs) + len(names.disturbances))
     if isinstance(plant, StateSpace):
         y = plant.response(signal, x0)
     else:
@@ -160,7 +174,7 @@ def excite(
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
     y = y + spread * np.random.default_rng(as_whole("seed", seed, 0)).standard_normal(y.shape)
-    return IOData(signal, y, dt, plant.names)
+    return IOData(signal, y, dt, names)
 
 
 def _column(name: str, value: Any) -> Array:

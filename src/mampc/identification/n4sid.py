@@ -103,7 +103,10 @@ def n4sid(
     A = np.linalg.lstsq(gamma[:-l], gamma[l:])[0]  # shift invariance
     A, stabilised = _inside_unit_circle(A, unstable)
     B, D = _input_matrices(A, C, u, y, feedthrough)
-    model = StateSpace(A, B, C, D, data.dt, u_op, y_op, data.names)
+    manipulated = len(data.names.inputs)
+    model = StateSpace(
+        A, B, C, D, data.dt, u_op[:manipulated], y_op, data.names, v_op=u_op[manipulated:]
+    )  # fmt: skip
     quality = validate(model, data)
     return Identified(model, quality.x0, singular_values, order, quality.fit, stabilised)
 

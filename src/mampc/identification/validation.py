@@ -43,9 +43,9 @@ def validate(model: StateSpace, data: IOData) -> Validation:
     """
     if not np.isclose(model.dt, data.dt, rtol=1e-6):
         raise MampcError(f"validate: expected a record sampled every {model.dt:g} s, received {data.dt:g} s")
-    if (data.u.shape[1], data.y.shape[1]) != (model.n_inputs, model.n_outputs):
+    if (data.u.shape[1], data.y.shape[1]) != (model.B.shape[1], model.n_outputs):
         raise MampcError(
-            f"validate: expected {model.n_inputs} inputs and {model.n_outputs} outputs, "
+            f"validate: expected {model.B.shape[1]} inputs and {model.n_outputs} outputs, "
             f"received {data.u.shape[1]} and {data.y.shape[1]}"
         )
     x0 = initial_state(model, data)

@@ -2,5 +2,6 @@
 
 from mampc.plants.plant import Plant, advance
 from mampc.plants.quadruple_tank import QuadrupleTank
+from mampc.plants.sofc import SolidOxideFuelCell
 
-__all__ = ["Plant", "QuadrupleTank", "advance"]
+__all__ = ["Plant", "QuadrupleTank", "SolidOxideFuelCell", "advance"]

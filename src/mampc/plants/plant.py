@@ -17,7 +17,9 @@ class Plant(Protocol):
     """A nonlinear plant dx/dt = derivative(x, u), y = output(x, u), in engineering units.
 
     `x` has shape (..., n) and `u` (..., m): the last axis holds the signals. Its dimensions are those of
-    `names`. A plant may have `u_op`, the inputs (m,) of its usual operating point.
+    `names`. A plant may have `u_op`, the inputs (m,) of its usual operating point; with measured
+    disturbances among its names, its methods take (..., m + d) inputs too and it has `v_op`, shape (d,).
+    A method `faults(x, u)` may name what takes it out of its range.
     """
 
     @property

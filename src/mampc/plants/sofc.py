@@ -69,6 +69,11 @@ class SolidOxideFuelCell:
     u_op: tuple[float, ...] = parameter((100.0, 100.0), "% of nominal flow", _PAPER)
     variant: str = "default"
 
+    @property
+    def v_op(self) -> tuple[float, ...]:
+        """The usual current in A."""
+        return (self.current,)
+
     names: ClassVar[Names] = Names(
         ("fuel", "air"), ("voltage",), ("p_H2", "p_H2O", "p_O2", "p_N2"), disturbances=("current",)
     )
@@ -80,8 +85,8 @@ class SolidOxideFuelCell:
             object.__setattr__(self, "h2_fraction", H2_FRACTIONS[self.variant])
         for name in (
             "n_cells", "anode_orifice", "cathode_orifice", "discharge_coefficient", "temperature",
-            "fuel_flow", "air_flow", "limiting_current", "exchange_current", "faraday", "gas_constant", "atmosphere",
-            "anode_volume", "cathode_volume", "cell_area",
+            "fuel_flow", "air_flow", "limiting_current", "exchange_current", "faraday", "gas_constant",
+            "atmosphere", "anode_volume", "cathode_volume", "cell_area",
         ):  # fmt: skip
             as_number(f"SolidOxideFuelCell.{name}", getattr(self, name), 0.0, exclusive=True)
         as_number("SolidOxideFuelCell.current", self.current, 0.0)

@@ -1,0 +1,288 @@
+"""Speed of mampc against what one would do without it, measured side by side in one run.
+
+    python benchmarks/bench.py
+
+Every row states a target and what was measured. Both sides of a ratio run in short interleaved blocks,
+so that whatever else the machine does hits both alike; the figure is the median over blocks of the
+ratio of the blocks' median times per call. To add a row, write a function that returns a `Row` and
+append it to `ROWS`.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from time import perf_counter
+from typing import NamedTuple
+
+import cvxpy as cp
+import daqp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import mampc
+from mampc.controllers.controller import Controller
+
+SAMPLES = 145
+RULES = mampc.MoveRules(max_moves=3, sparsity_horizon=3)
+PAPER = mampc.Alternating(penalty=10.0, tolerance=1e-4)
+LAMBDA = 0.1
+HEAVY = ("scipy.signal", "matplotlib", "pandas", "plotly")
+
+
+class Row(NamedTuple):
+    """One line of the table."""
+
+    name: str
+    target: str
+    measured: str
+    detail: str
+    passed: bool
+
+
+class Comparison(NamedTuple):
+    """Median seconds per call of two series, and the median over blocks of the first over the second."""
+
+    first: float
+    second: float
+    ratio: float
+
+    def __str__(self) -> str:
+        return f"{_readable(self.first)} against {_readable(self.second)}"
+
+
+Calls = Sequence[Callable]
+
+
+def interleaved(blocks: Sequence[tuple[Calls, Calls]]) -> Comparison:
+    """Time two kinds of calls block by block, in alternating order; the first block also runs untimed."""
+    medians = []
+    for number, block in enumerate([blocks[0], *blocks]):
+        times = {}
+        for key in (0, 1) if number % 2 else (1, 0):
+            times[key] = statistics.median(_timed(call) for call in block[key])
+        if number:
+            medians.append((times[0], times[1]))
+    return Comparison(
+        statistics.median(a for a, _ in medians),
+        statistics.median(b for _, b in medians),
+        statistics.median(a / b for a, b in medians),
+    )
+
+
+def _readable(seconds: float) -> str:
+    return f"{seconds * 1e6:.1f} us" if seconds < 1e-3 else f"{seconds * 1e3:.1f} ms"
+
+
+def _timed(call: Callable) -> float:
+    start = perf_counter()
+    call()
+    return perf_counter() - start
+
+
+class Asked(NamedTuple):
+    """What a controller is asked at one sample of a closed loop."""
+
+    state: mampc.ControllerState
+    x: np.ndarray
+    reference: np.ndarray
+    output_disturbance: np.ndarray
+
+
+def tank_problem() -> mampc.TrackingProblem:
+    """The paper's size and weights on a model identified from the noisy tank."""
+    u = mampc.prbs(order=8, amplitude=25.0, hold=5, mean=[50.0, 50.0])
+    data = mampc.excite(mampc.plants.QuadrupleTank(), u, dt=10.0, noise=0.1, seed=1)
+    return mampc.TrackingProblem(
+        mampc.n4sid(data, order=4, feedthrough=False).model,
+        prediction_horizon=10, control_horizon=5, move_weight=LAMBDA,
+        limits=mampc.Limits(u_min=0.0, u_max=100.0),
+    )  # fmt: skip
+
+
+def closed_loop(controller: Controller) -> list[Asked]:
+    """What the controller is asked in a noisy run of the nonlinear tank."""
+    plant, asked, step = mampc.plants.QuadrupleTank(), [], controller.step
+
+    def recording(state, x, reference, *, output_disturbance, **others):
+        asked.append(Asked(state, x, reference, output_disturbance))
+        return step(state, x, reference, output_disturbance=output_disturbance, **others)
+
+    y_op = plant.output(plant.steady_state())
+    changes = ((5, (2.0, 2.0)), (50, (-1.0, -1.5)), (100, (1.0, 0.5)))
+    reference = mampc.steps(SAMPLES, y_op, [(k, y_op + change) for k, change in changes])
+    controller.step = recording
+    try:
+        mampc.simulate(plant, mampc.Regulator(controller), reference, noise=0.1, progress=False)
+    finally:
+        del controller.step
+    return asked
+
+
+def steps_of(controller: Controller, asked: Sequence[Asked]) -> list[Callable]:
+    """One call of the controller per sample."""
+    return [
+        partial(controller.step, a.state, a.x, a.reference, output_disturbance=a.output_disturbance)
+        for a in asked
+    ]
+
+
+def mpc_against_bare_daqp(*, bounds: bool) -> Row:
+    """A whole MPC step (parameters, checks, optimum, decision) against the bare solver on its programs."""
+    mpc = mampc.MPC(tank_problem())
+    asked, program = closed_loop(mpc), mpc.condensed.program
+    instances = [
+        mpc.condensed.instance(
+            mpc.condensed.parameter(a.x, a.state.inputs[-1], a.reference, a.output_disturbance),
+            a.state.inputs[-1],
+        )
+        for a in asked
+    ]
+    model = daqp.Model()
+    model.settings = {"primal_tol": 1e-9}
+    wide = np.full(program.n_bounds, 1e30)
+    model.setup(
+        program.H, np.zeros(program.n_variables), program.A, wide, -wide, np.zeros(len(wide), np.intc)
+    )
+
+    def solve(**changed):
+        model.update(**changed)
+        return model.solve()
+
+    data = [{"f": i.f.copy()} for i in instances]
+    if bounds:
+        data = [{"f": i.f.copy(), "blower": i.lower.copy(), "bupper": i.upper.copy()} for i in instances]
+    ours, bare = steps_of(mpc, asked), [partial(solve, **changed) for changed in data]
+    difference = max(np.abs(a().changes.ravel() - b()[0]).max() for a, b in zip(ours, bare, strict=True))
+    times = interleaved([(ours, bare)] * 100)
+    return Row(
+        f"MPC step / bare warm daqp, update({'f and bounds' if bounds else 'f'}) + solve",
+        "at most 4",
+        f"{times.ratio:.2f}",
+        f"{times}; moves differ by {difference:.0e}",
+        times.ratio <= 4,
+    )
+
+
+class Transcription:
+    """The paper's Algorithm 1 as one would write it in CVXPY, compiled once, solved by daqp."""
+
+    def __init__(self, problem: mampc.TrackingProblem) -> None:
+        model, n_p, n_c = problem.model, problem.prediction_horizon, problem.control_horizon
+        m, l, ns = model.n_inputs, model.n_outputs, RULES.sparsity_horizon
+        self.past, self.x = cp.Parameter((m, ns)), cp.Parameter(model.n_states)
+        self.target, self.v = cp.Parameter(l), cp.Parameter((m, ns + n_c - 1))  # target: r - d_y - y_op
+        self.u, X = cp.Variable((m, n_c)), cp.Variable((n_p + 1, model.n_states))
+        moves = cp.diff(cp.hstack([self.past, self.u]), axis=1)
+        held = np.eye(n_c)[np.minimum(np.arange(n_p + 1), n_c - 1)] @ self.u.T - model.u_op[None]
+        error = cp.reshape(self.target, (1, l), order="C") - X @ model.C.T - held @ model.D.T
+        self.first_step = cp.Problem(
+            cp.Minimize(
+                cp.sum_squares(error)
+                + LAMBDA * cp.sum_squares(moves[:, ns - 1 :])
+                + PAPER.penalty * cp.sum_squares(self.v - moves)
+            ),
+            [
+                X[0] == self.x,
+                X[1:] == X[:-1] @ model.A.T + held[:-1] @ model.B.T,
+                self.u >= problem.limits.u_min[:, None],
+                self.u <= problem.limits.u_max[:, None],
+            ],
+        )
+        self.y_op = model.y_op
+
+    def plan(self, asked: Asked) -> np.ndarray:
+        """The planned inputs, shape (nc, m), from the same first guess of v."""
+        self.past.value, self.x.value = asked.state.inputs.T, asked.x
+        self.target.value = asked.reference - asked.output_disturbance - self.y_op
+        v, last = np.zeros(self.v.shape), None
+        if asked.state.guess is not None:
+            v[:, -len(asked.state.guess) :] = asked.state.guess.T
+        for _ in range(PAPER.max_iterations):
+            self.v.value = v
+            self.first_step.solve(solver=cp.DAQP)
+            u = self.u.value
+            moves = np.diff(np.hstack([self.past.value, u]))
+            largest = np.argsort(-np.abs(moves).ravel(), kind="stable")[: RULES.max_moves]
+            v = np.zeros(moves.shape)
+            v.flat[largest] = moves.flat[largest]
+            if last is not None and np.abs(u - last).sum() <= PAPER.tolerance:
+                break
+            last = u
+        return u.T
+
+
+def alternating_against_cvxpy() -> Row:
+    """The alternating method per step against the transcription, on the same samples."""
+    problem = tank_problem()
+    controller = mampc.MAMPC(problem, RULES, method=PAPER)
+    asked = [a for a in closed_loop(controller) if a.state.samples >= RULES.sparsity_horizon][::14]
+    transcription = Transcription(problem)
+    ours, theirs = steps_of(controller, asked), [partial(transcription.plan, a) for a in asked]
+    decisions = [step() for step in ours]
+    difference = max(np.abs(d.plan - plan()).max() for d, plan in zip(decisions, theirs, strict=True))
+    times = interleaved([([plan], [step] * 25) for plan, step in zip(theirs, ours, strict=True)] * 4)
+    rounds = statistics.median(d.iterations for d in decisions)
+    return Row(
+        "paper's method in CVXPY (compiled once, daqp) / alternating MAMPC step",
+        "at least 100",
+        f"{times.ratio:.0f}",
+        f"{times}; {rounds:.0f} rounds; plans differ by {difference:.0e}",
+        times.ratio >= 100,
+    )
+
+
+def import_time() -> Row:
+    """`import mampc` in fresh interpreters, from compiled bytecode."""
+    code = (
+        "import sys, time; start = time.perf_counter(); import mampc; "
+        f"print(time.perf_counter() - start, *(name for name in {HEAVY} if name in sys.modules))"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+
+    def once() -> list[str]:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+        )
+        return done.stdout.split()
+
+    once()  # compiles what is not compiled yet
+    runs = [once() for _ in range(7)]
+    times, loaded = [float(run[0]) * 1e3 for run in runs], runs[0][1:]
+    median = statistics.median(times)
+    return Row(
+        "import mampc",
+        "under 250 ms",
+        f"{median:.0f} ms",
+        f"median of 7, least {min(times):.0f} ms; heavy modules loaded: {', '.join(loaded) or 'none'}",
+        median < 250 and not loaded,
+    )
+
+
+ROWS: list[Callable[[], Row]] = [
+    partial(mpc_against_bare_daqp, bounds=False),
+    partial(mpc_against_bare_daqp, bounds=True),
+    alternating_against_cvxpy,
+    import_time,
+]
+
+
+def main() -> None:
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)
+    table = Table("", "measured", "target", "", "detail", title="mampc benchmark")
+    for measure in ROWS:
+        row = measure()
+        verdict = "[green]PASS[/]" if row.passed else "[red]MISS[/]"
+        table.add_row(row.name, row.measured, row.target, verdict, row.detail)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Models, problems and plain re-computations that several tests share."""
+
+from functools import lru_cache
+
+import numpy as np
+
+import mampc
+
+PAPER_STEPS = ((5, (2.0, 2.0)), (50, (-1.0, -1.5)), (100, (1.0, 0.5)))  # deviations from the operating point
+
+
+def random_model(seed, n=3, m=2, l=2, *, feedthrough=False, radius=0.9):
+    """A stable model with an operating point; its slowest pole has the given radius."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    A *= radius / np.max(np.abs(np.linalg.eigvals(A)))
+    B, C = rng.standard_normal((n, m)), rng.standard_normal((l, n))
+    D = rng.standard_normal((l, m)) if feedthrough else None
+    return mampc.StateSpace(A, B, C, D, 1.0, rng.uniform(-2, 2, m), rng.uniform(-2, 2, l))
+
+
+def random_weight(rng, size, low=0.1):
+    """A positive definite weight, now a scalar, now a diagonal, now a full matrix."""
+    kind = rng.integers(3)
+    if kind == 0:
+        return float(rng.uniform(low, 2))
+    if kind == 1:
+        return rng.uniform(low, 2, size)
+    root = rng.standard_normal((size, size))
+    return root @ root.T / size + low * np.eye(size)
+
+
+def tank_model(dt=10.0):
+    """The exact linear model of the quadruple tank."""
+    return mampc.linearise(mampc.plants.QuadrupleTank()).discretise(dt)
+
+
+def tank_problem(model=None, **changes):
+    """The paper's horizons and weights on the tank."""
+    settings = {
+        "prediction_horizon": 10, "control_horizon": 5, "move_weight": 0.1,
+        "limits": mampc.Limits(u_min=0.0, u_max=100.0),
+    }  # fmt: skip
+    return mampc.TrackingProblem(tank_model() if model is None else model, **(settings | changes))
+
+
+@lru_cache
+def identified_tank():
+    """A fourth-order model of the tank from noisy pseudo-random binary inputs."""
+    u = mampc.prbs(order=8, amplitude=25.0, hold=5, mean=[50.0, 50.0])
+    data = mampc.excite(mampc.plants.QuadrupleTank(), u, dt=10.0, noise=0.1, seed=1)
+    return mampc.n4sid(data, order=4, feedthrough=False).model
+
+
+def tank_reference(samples=145):
+    """The staircase of the tank study, absolute."""
+    plant = mampc.plants.QuadrupleTank()
+    y_op = plant.output(plant.steady_state())
+    return mampc.steps(samples, y_op, [(k, y_op + change) for k, change in PAPER_STEPS])
+
+
+def predicted(model, x, plan, samples, input_disturbance=0.0, output_disturbance=0.0):
+    """Outputs y_0 .. y_{samples-1} of the model under planned inputs, held after the last one."""
+    outputs = []
+    for i in range(samples):
+        u = plan[min(i, len(plan) - 1)] + input_disturbance - model.u_op
+        outputs.append(model.y_op + model.C @ x + model.D @ u + output_disturbance)
+        x = model.A @ x + model.B @ u
+    return np.array(outputs)
+
+
+def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, output_disturbance=0.0):
+    """The cost of planned inputs as `TrackingProblem` states it, by simulating the model."""
+    n_p, limits = problem.prediction_horizon, problem.limits
+    y = predicted(problem.model, x, plan, n_p + 1, input_disturbance, output_disturbance)
+    error = np.broadcast_to(reference, y.shape) - y
+    changes = np.diff(np.vstack([u_previous, plan]), axis=0)
+    weighed = changes if problem.weigh_first_move else changes[1:]
+    excess = np.maximum(0.0, np.maximum(y - limits.y_max, limits.y_min - y))[1:].max(axis=0)
+    return (
+        np.einsum("ia,ab,ib", error, problem.output_weight, error)
+        + np.einsum("ja,ab,jb", weighed, problem.move_weight, weighed)
+        + problem.output_limit_weight * np.sum(excess + excess**2 / 2)
+    )
+
+
+def same_decision(a, b, atol=1e-12):
+    """Whether two decisions agree: to the rounding that a warm start leaves, or exactly with atol=0."""
+    return a.status is b.status and all(
+        np.allclose(getattr(a, name), getattr(b, name), rtol=atol, atol=atol, equal_nan=True)
+        for name in ("plan", "changes", "objective", "lower_bound")
+    )
+
+
+def sample_data(condensed, u_previous, **parameter):
+    """The condensed data of one sample."""
+    return condensed.instance(condensed.parameter(u_previous=u_previous, **parameter), u_previous)

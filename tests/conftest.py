@@ -1,0 +1,42 @@
+"""Every optimal solve of every test is checked for its optimality conditions."""
+
+import numpy as np
+import pytest
+
+from mampc.qp import UNBOUNDED, QPStatus
+from mampc.qp_daqp import DaqpSolver
+
+TOLERANCE = 1e-8  # relative to the sizes of the data
+
+
+def largest(array):
+    return np.max(np.abs(array), initial=0.0)
+
+
+def certify(program, f, lower, upper, solution):
+    """Fail unless the solution satisfies the Karush-Kuhn-Tucker conditions of its program."""
+    z, pull = solution.z, solution.multipliers
+    bounds = np.concatenate([lower, upper])
+    bounds = bounds[np.abs(bounds) < UNBOUNDED]
+    size = max(1.0, np.max(np.abs(program.rows(z)), initial=0.0), np.max(np.abs(bounds), initial=0.0))
+    gradient = max(
+        1.0, np.max(np.abs(f)), np.max(np.abs(program.H)) * np.max(np.abs(z)), np.max(np.abs(pull), initial=0)
+    )
+    assert program.primal_residual(lower, upper, solution) <= TOLERANCE * size
+    assert program.dual_residual(f, solution) <= TOLERANCE * gradient
+    assert program.duality_gap(lower, upper, solution) <= TOLERANCE * gradient * size
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _every_optimal_solve_is_certified():
+    solve = DaqpSolver.solve
+
+    def certified(self, f, lower, upper):
+        solution = solve(self, f, lower, upper)
+        if solution.status is QPStatus.OPTIMAL:
+            certify(self.program, f, lower, upper, solution)
+        return solution
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DaqpSolver, "solve", certified)
+        yield

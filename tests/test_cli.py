@@ -1,0 +1,111 @@
+"""The command line: what it prints, writes, refuses and returns."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import mampc
+from mampc.study import template
+
+
+def call(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-c", "from mampc.cli import main; main()", *map(str, arguments)],
+        cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory):
+    """A CSV file of a known model's response, and the model."""
+    folder = tmp_path_factory.mktemp("record")
+    rng = np.random.default_rng(0)
+    model = mampc.StateSpace([[0.8, 0.1], [0.0, 0.6]], [[1.0, 0.2], [0.3, 1.0]], np.eye(2), None, dt=10.0)
+    u = mampc.prbs(order=7, amplitude=2.0, inputs=2, hold=3, mean=5.0)
+    y = model.response(u) + 0.05 * rng.standard_normal((len(u), 2))
+    path = folder / "data.csv"
+    mampc.IOData(u, y, 10.0, mampc.Names(("valve", "pump"), ("level", "flow"))).to_csv(path)
+    return path
+
+
+def test_identify_writes_a_model_and_its_validation(record, tmp_path):
+    out = tmp_path / "model.json"
+    done = call(
+        "identify", record, "--inputs", "valve,pump", "--outputs", "level,flow", "--dt", "10", "--out", out,
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Order 2" in done.stdout
+    model = mampc.StateSpace.load(out)
+    assert model.names.inputs == ("valve", "pump")
+    np.testing.assert_allclose(np.sort(model.poles().real), [0.6, 0.8], atol=0.05)
+    for kind in ("png", "svg"):
+        assert (tmp_path / f"model.{kind}").stat().st_size > 1000
+
+
+def test_new_writes_a_study_once_and_run_runs_it(tmp_path):
+    assert call("new", "my-study.toml", cwd=tmp_path).returncode == 0
+    study = tmp_path / "my-study.toml"
+    assert study.read_text() == template()
+    again = call("new", "my-study.toml", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "does not exist yet" in again.stderr
+    study.write_text(
+        template().replace("steps = 145", "steps = 20").replace("prbs_order = 8", "prbs_order = 6")
+    )
+    done = call("run", "my-study.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "MAMPC ns=3" in done.stdout
+    summary = json.loads((tmp_path / "results" / "my-study" / "summary.json").read_text())
+    assert summary["steps"] == 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("run", "no-such-study"), "quadruple-tank"),
+        (("run", "bad.toml"), "did you mean 'steps'"),
+        (("identify", "none.csv", "--inputs", "u", "--outputs", "y", "--dt", "1"), "none.csv"),
+        (("identify", "empty.csv", "--inputs", "u", "--outputs", "y", "--dt", "1"), "at least one row"),
+        (("identify", "ragged.csv", "--inputs", "u", "--outputs", "y", "--dt", "1"), "expected 2 fields"),
+        (("identify", "short.csv", "--inputs", "u", "--outputs", "y", "--dt", "1"), "samples"),
+        (("identify", "short.csv", "--inputs", "u", "--outputs", "z", "--dt", "1"), "'z'"),
+        (("identify", "short.csv", "--inputs", "u", "--outputs", "y", "--dt", "-1"), "dt"),
+        (("new", "no-such-folder/study.toml"), "written"),
+        (("identify", "short.csv"), "--inputs"),
+    ],
+)
+def test_complaints_go_to_standard_error_without_a_traceback(arguments, expected, tmp_path):
+    (tmp_path / "bad.toml").write_text(template().replace("steps = 145", "stepps = 145"))
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "ragged.csv").write_text("u,y\n1,2\n3\n")
+    (tmp_path / "short.csv").write_text("u,y\n1,2\n3,4\n")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    done = call(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr + done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("command", [(), ("run",), ("new",), ("identify",)])
+def test_help_shows_how(command, tmp_path):
+    done = call(*command, "--help", cwd=tmp_path)
+    assert done.returncode == 0
+    if command:
+        assert f"mampc {command[0]} " in done.stdout.split("Example", 1)[1]
+
+
+def test_the_readme_example_runs(tmp_path):
+    from pathlib import Path
+
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    code = readme.split("```python")[1].split("```")[0]
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "tracking_error" in done.stdout

@@ -1,0 +1,367 @@
+"""The loop as a whole: estimator and controller on a plant, and what is measured of a run."""
+
+import copy
+import csv
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import identified_tank, same_decision, tank_model, tank_problem, tank_reference
+from mampc import Status
+
+TANK = mampc.plants.QuadrupleTank()
+
+
+def stable_model():
+    """Two inputs and outputs that interact, with a feedthrough and an operating point."""
+    return mampc.StateSpace(
+        [[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.6]],
+        [[0.5, 0.1], [0.0, 0.6], [0.3, 0.2]],
+        [[1.0, 0.0, 0.2], [0.1, 1.0, 0.0]],
+        [[0.1, 0.0], [0.0, 0.0]],
+        2.0,
+        [10.0, 20.0],
+        [1.0, 2.0],
+    )
+
+
+def integrating_model():
+    return mampc.StateSpace([[1.0, 0.3], [0.0, 0.6]], [[0.1], [0.4]], [[1.0, 0.0]], None, 1.0, [5.0], [3.0])
+
+
+def regulator(model, disturbance="output", rules=None, **options):
+    problem = mampc.TrackingProblem(
+        model, **({"prediction_horizon": 15, "control_horizon": 4, "move_weight": 0.1} | options)
+    )
+    controller = mampc.MPC(problem)
+    if rules is not None:
+        controller = mampc.MAMPC(problem, rules, method=mampc.Alternating(polish=True, warm_up=0))
+    return mampc.Regulator(controller, mampc.KalmanFilter.offset_free(model, disturbance=disturbance))
+
+
+# Steady offset
+
+
+@pytest.mark.parametrize("disturbance", ["output", "input"])
+@pytest.mark.parametrize("gain", [0.7, 1.0, 1.3])
+def test_constant_disturbances_and_a_wrong_gain_leave_no_steady_offset(disturbance, gain):
+    model = stable_model()
+    plant = replace(model, B=gain * model.B, D=gain * model.D)
+    reference = model.y_op + np.array([1.0, -0.5])
+    run = mampc.simulate(
+        plant, regulator(model, disturbance), reference, steps=150,
+        input_disturbance=[0.4, -0.3], output_disturbance=[0.5, 0.2],
+    )  # fmt: skip
+    assert np.abs(run.y[:5] - reference).max() > 0.1
+    np.testing.assert_allclose(run.y[-10:], run.r[-10:], atol=1e-6)
+
+
+def test_an_integrating_model_has_no_offset_with_disturbances_at_its_inputs():
+    model = integrating_model()
+    plant = replace(model, B=1.3 * model.B)
+    run = mampc.simulate(
+        plant, regulator(model, "input"), model.y_op + 2.0, steps=500,
+        input_disturbance=[0.3], output_disturbance=[0.2],
+    )  # fmt: skip
+    np.testing.assert_allclose(run.y[-10:], run.r[-10:], atol=1e-6)
+
+
+def test_an_integrating_model_is_refused_with_disturbances_at_its_outputs():
+    with pytest.raises(mampc.MampcError, match=r"expected.*observable.*received.*disturbance='input'"):
+        mampc.KalmanFilter.offset_free(integrating_model(), disturbance="output")
+
+
+def test_the_estimator_filters_noise_and_forgets_its_start():
+    model = stable_model()
+    kalman = mampc.KalmanFilter.offset_free(model)
+    poles = np.linalg.eigvals(
+        (np.eye(5) - kalman.gain @ np.hstack([model.C, np.eye(2)]))
+        @ np.block([[model.A, np.zeros((3, 2))], [np.zeros((2, 3)), np.eye(2)]])
+    )
+    assert np.abs(poles).max() < 1.0
+
+
+# The regulator's step
+
+
+def test_a_regulators_step_is_pure_and_copies_decide_the_same():
+    loop = regulator(stable_model(), limits=mampc.Limits(u_min=9.0, u_max=21.0, du_max=0.5))
+    state, y, reference = loop.initial_state(), np.array([1.3, 1.8]), np.array([2.0, 3.0])
+    kept = copy.deepcopy((state, y, reference))
+    first = loop.step(state, y, reference)
+    loop.step(first.state, -y, reference)
+    assert same_decision(loop.step(state, y, reference), first)
+    twin = pickle.loads(pickle.dumps(loop))
+    again = twin.step(pickle.loads(pickle.dumps(state)), y, reference)
+    assert same_decision(again, first)
+    np.testing.assert_allclose(again.state.estimate.x, first.state.estimate.x, atol=1e-14)
+    np.testing.assert_array_equal(state.estimate.x, kept[0].estimate.x)
+    np.testing.assert_array_equal(state.controller.inputs, kept[0].controller.inputs)
+    np.testing.assert_array_equal(y, kept[1])
+    np.testing.assert_array_equal(reference, kept[2])
+
+
+def test_the_estimator_predicts_with_the_inputs_that_were_really_applied():
+    model = stable_model()
+    loop = regulator(model)
+    state, y, u = loop.initial_state(), model.y_op, model.u_op + np.array([1.0, -1.0])
+    applied, decided = (loop.step(state, y, y, u_applied=v).state.estimate for v in (u, None))
+    by_hand = loop.estimator.correct(loop.estimator.predict(state.estimate, u), u, y)
+    np.testing.assert_array_equal(applied.x, by_hand.x)
+    assert not np.allclose(applied.x, decided.x)
+
+
+def test_moves_are_counted_and_limited_from_the_inputs_that_were_really_applied():
+    rules = mampc.MoveRules(max_moves=1, sparsity_horizon=2)
+    model = stable_model()
+    loop = regulator(model, rules=rules, limits=mampc.Limits(du_max=3.0))
+    reference = model.y_op + 1.0
+    first = loop.step(loop.initial_state(), model.y_op, reference)
+    assert first.moves[0].sum() == 1
+    assert not loop.step(first.state, model.y_op, reference).moves.any()
+    refused = loop.step(first.state, model.y_op, reference, u_applied=model.u_op)
+    assert refused.moves.sum() == 1
+    elsewhere = model.u_op + np.array([40.0, 0.0])
+    moved = loop.step(loop.initial_state(), model.y_op, reference, u_applied=elsewhere)
+    assert (np.abs(moved.u - elsewhere) <= 3.0).all()
+    np.testing.assert_array_equal(moved.state.controller.inputs[0], elsewhere)
+
+
+@pytest.mark.parametrize("unknown", [[np.nan, 1.0], [np.inf, 1.0], [-np.inf, np.nan]])
+def test_applied_inputs_that_are_not_known_are_taken_to_be_those_decided(unknown):
+    model = stable_model()
+    loop = regulator(model)
+    arguments = loop.initial_state(), model.y_op + 0.1, model.y_op
+    assert same_decision(loop.step(*arguments, u_applied=unknown), loop.step(*arguments))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
+@pytest.mark.filterwarnings("error")
+def test_a_bad_measurement_holds_the_inputs_and_the_loop_recovers(bad):
+    model = stable_model()
+    loop, reference = regulator(model), model.y_op + np.array([1.0, -0.5])
+    state, x, u = loop.initial_state(), np.zeros(3), model.u_op
+    for k in range(120):
+        y = model.y_op + model.C @ x + model.D @ (u - model.u_op)
+        spoiled = 3 <= k < 6
+        decision = loop.step(state, [y[0], bad] if spoiled else y, reference)
+        if spoiled:
+            assert decision.status is Status.HELD_BAD_MEASUREMENT
+            np.testing.assert_array_equal(decision.u, u)
+        else:
+            assert decision.status is Status.OPTIMAL
+        state, u = decision.state, decision.u
+        x = model.A @ x + model.B @ (u - model.u_op)
+    np.testing.assert_allclose(y, reference, atol=1e-6)
+
+
+@pytest.mark.parametrize("disturbance", ["output", "input"])
+def test_a_start_at_a_known_rest_away_from_the_operating_point_has_no_jump(disturbance):
+    model = stable_model()
+    u = model.u_op + np.array([3.0, -2.0])
+    y = model.y_op + model.C @ model.steady_state(u) + model.D @ (u - model.u_op)
+    loop = regulator(model, disturbance)
+    np.testing.assert_allclose(loop.step(loop.initial_state(u, y), y, y).u, u, atol=1e-8)
+
+
+def test_arrays_of_the_wrong_shape_raise():
+    model = stable_model()
+    loop = regulator(model)
+    state, y = loop.initial_state(), model.y_op
+    for arguments, options in (
+        ((y[:1], y), {}),
+        ((y[None], y), {}),
+        ((y, y[:1]), {}),
+        ((y, np.zeros((3, 2))), {}),
+        ((y, y), {"u_applied": [1.0]}),
+    ):
+        with pytest.raises(mampc.MampcError, match=r"expected.*received"):
+            loop.step(state, *arguments, **options)
+
+
+# Simulation
+
+
+@pytest.mark.parametrize("plant", [TANK, tank_model()], ids=["nonlinear", "linear"])
+def test_a_run_is_reproduced_by_its_seed(plant):
+    reference = tank_reference(20)
+    runs = [
+        mampc.simulate(plant, mampc.Regulator(mampc.MPC(tank_problem())), reference, noise=0.1, seed=seed)
+        for seed in (3, 3, 4)
+    ]
+    np.testing.assert_array_equal(runs[0].u, runs[1].u)
+    np.testing.assert_array_equal(runs[0].y_measured, runs[1].y_measured)
+    assert np.abs(runs[0].y_measured - runs[2].y_measured).max() > 0.1
+
+
+def test_equal_seeds_give_equal_noise_to_different_regulators():
+    rules = mampc.MoveRules(max_moves=3, sparsity_horizon=3)
+    noises = []
+    for controller in (mampc.MPC(tank_problem()), mampc.MAMPC(tank_problem(), rules)):
+        run = mampc.simulate(tank_model(), mampc.Regulator(controller), tank_reference(30), noise=[0.1, 0.3])
+        noises.append(run.y_measured - run.y)
+    np.testing.assert_allclose(noises[0], noises[1], atol=1e-12)
+    assert noises[0].std(axis=0) == pytest.approx([0.1, 0.3], rel=0.5)
+
+
+def test_references_may_be_constant_or_rows_of_which_the_last_is_repeated():
+    plant, loop = tank_model(), mampc.Regulator(mampc.MPC(tank_problem()))
+    reference = tank_reference(8)
+    constant = mampc.simulate(plant, loop, reference[0], steps=4)
+    np.testing.assert_array_equal(constant.r, np.tile(reference[0], (4, 1)))
+    longer = mampc.simulate(plant, loop, reference, steps=11)
+    np.testing.assert_array_equal(longer.r, np.vstack([reference, np.tile(reference[-1], (3, 1))]))
+    shorter = mampc.simulate(plant, loop, reference, steps=6)
+    np.testing.assert_array_equal(shorter.r, reference[:6])
+    np.testing.assert_array_equal(shorter.t, 10.0 * np.arange(6))
+    assert {len(shorter.u), len(shorter.y), len(shorter.decisions), len(shorter.solve_times)} == {6}
+    assert shorter.statuses == {"optimal": 6}
+
+
+def test_steps_hold_each_value_from_its_sample_on():
+    staircase = mampc.steps(6, [1.0, 2.0], [(4, [0.0, 0.0]), (2, [5.0, 6.0])])
+    np.testing.assert_array_equal(staircase, [[1, 2], [1, 2], [5, 6], [5, 6], [0, 0], [0, 0]])
+
+
+@pytest.mark.parametrize("preview", [False, True])
+def test_the_regulator_sees_the_reference_from_now_on_and_only_with_preview(monkeypatch, preview):
+    seen, loop, reference = [], mampc.Regulator(mampc.MPC(tank_problem())), tank_reference(14)
+    step = loop.step
+    monkeypatch.setattr(loop, "step", lambda state, y, r: seen.append(r) or step(state, y, r))
+    mampc.simulate(tank_model(), loop, reference, preview=preview)
+    for k, r in enumerate(seen):
+        ahead = [reference[min(k + i, 13)] for i in range(11)]
+        np.testing.assert_array_equal(r, ahead if preview else reference[k])
+
+
+def test_preview_lowers_the_tracking_error():
+    loop, reference = mampc.Regulator(mampc.MPC(tank_problem())), tank_reference(80)
+    blind, seeing = (
+        mampc.simulate(tank_model(), loop, reference, preview=preview).metrics().tracking_error
+        for preview in (False, True)
+    )
+    assert seeing < 0.8 * blind
+
+
+@pytest.mark.parametrize("u", [None, [55.0, 45.0]], ids=["operating point", "elsewhere"])
+@pytest.mark.parametrize("identified", [False, True])
+def test_a_loop_that_starts_at_its_reference_stays_there(u, identified):
+    problem = tank_problem(identified_tank() if identified else tank_model())
+    reference = TANK.output(TANK.steady_state(u))
+    loop = mampc.Regulator(mampc.MPC(problem))
+    run = mampc.simulate(TANK, loop, reference, steps=30, u_initial=u)
+    assert np.abs(run.u - run.u_initial).max() < 1e-8
+    np.testing.assert_allclose(run.y, run.r, atol=1e-6)
+
+
+def test_disturbances_act_where_they_are_said_to():
+    model = stable_model()
+    loop = regulator(model)
+    at_output = np.zeros((6, 2))
+    at_output[2:, 1] = 0.7
+    run = mampc.simulate(model, loop, model.y_op, steps=6, output_disturbance=at_output)
+    np.testing.assert_allclose(run.y[:3] - model.y_op, at_output[:3], atol=1e-9)
+    run = mampc.simulate(model, loop, model.y_op, steps=6, input_disturbance=[0.0, 0.5])
+    np.testing.assert_allclose(run.y[1], model.y_op + model.C @ model.B @ [0.0, 0.5], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"reference": [1.0, 2.0, 3.0]},
+        {"reference": np.zeros((5, 3))},
+        {"reference": np.empty((0, 2)), "steps": None},
+        {"reference": [1.0, np.nan]},
+        {"steps": None},
+        {"steps": 0},
+        {"noise": -0.1},
+        {"noise": [0.1, 0.1, 0.1]},
+        {"input_disturbance": [1.0, 2.0, 3.0]},
+        {"output_disturbance": np.zeros((5, 1))},
+        {"u_initial": [1.0]},
+        {"plant": integrating_model()},
+        {"plant": replace(stable_model(), dt=3.0)},
+    ],
+    ids=str,
+)
+def test_arguments_that_do_not_fit_together_are_refused(options):
+    arguments = {"plant": stable_model(), "reference": [1.0, 2.0], "steps": 5} | options
+    plant, reference = arguments.pop("plant"), arguments.pop("reference")
+    with pytest.raises(mampc.MampcError, match=r"expected"):
+        mampc.simulate(plant, regulator(stable_model()), reference, **arguments)
+
+
+# Measures of a run
+
+
+def hand_made_run():
+    """Five samples, two inputs and one output; y deviates from r by 0, 1, -2, 0, 1."""
+    u = np.array([[1.0, 0.0], [1.0, 0.05], [3.0, 0.05], [2.5, 0.0], [2.5, 0.0]])
+    y = np.array([[0.0], [1.0], [-2.0], [0.0], [1.0]])
+    return mampc.Run(
+        t=2.0 * np.arange(5), u=u, y=y, y_measured=y + 0.5, r=np.zeros((5, 1)), u_initial=np.zeros(2),
+        decisions=(), dt=2.0, names=mampc.Names(("valve", "pump"), ("level",)), v=np.empty((5, 0)), faults={},
+    )  # fmt: skip
+
+
+def test_metrics_equal_those_worked_out_by_hand():
+    metrics = hand_made_run().metrics(threshold=0.1)  # changes: (1, 0), (0, .05), (2, 0), (-.5, -.05), (0, 0)
+    np.testing.assert_allclose(metrics.sparse_density, [3 / 5, 0.0])
+    np.testing.assert_allclose(metrics.exact_density, [3 / 5, 2 / 5])
+    np.testing.assert_array_equal(metrics.moves, [3, 2])
+    assert metrics.tracking_error == pytest.approx(6 / 5)
+    np.testing.assert_allclose(metrics.travel, [3.5, 0.1])
+    np.testing.assert_array_equal(metrics.reversals, [1, 1])
+    np.testing.assert_allclose(metrics.mean_hold_time, [10 / 4, 10 / 3])
+    assert (metrics.steps, metrics.skipped, metrics.threshold) == (5, 0, 0.1)
+
+
+def test_metrics_without_the_first_samples_equal_those_worked_out_by_hand():
+    metrics = hand_made_run().metrics(threshold=0.0, skip=2)
+    np.testing.assert_allclose(metrics.sparse_density, [2 / 3, 1 / 3])
+    np.testing.assert_allclose(metrics.exact_density, [2 / 3, 1 / 3])
+    assert metrics.tracking_error == pytest.approx(5 / 3)
+    np.testing.assert_allclose(metrics.travel, [2.5, 0.05])
+    np.testing.assert_array_equal(metrics.reversals, [1, 0])
+    assert (metrics.steps, metrics.skipped) == (3, 2)
+
+
+@pytest.mark.parametrize("options", [{"skip": 5}, {"skip": -1}, {"threshold": -0.1}, {"threshold": np.nan}])
+def test_metrics_refuse_settings_out_of_range(options):
+    with pytest.raises(mampc.MampcError, match=r"expected.*received"):
+        hand_made_run().metrics(**options)
+
+
+def test_a_run_is_written_with_all_its_columns_in_full_precision(tmp_path):
+    run = mampc.simulate(TANK, mampc.Regulator(mampc.MPC(tank_problem())), tank_reference(8), noise=0.1)
+    run.to_csv(tmp_path / "run.csv")
+    with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    assert header == [
+        "time", "u1", "u2", "y1", "y2", "y1_measured", "y2_measured", "y1_reference", "y2_reference",
+        "status", "objective", "iterations", "solve_time_us",
+    ]  # fmt: skip
+    numbers = np.array([row[:9] for row in rows], dtype=float)
+    np.testing.assert_array_equal(numbers, np.column_stack([run.t, run.u, run.y, run.y_measured, run.r]))
+    assert [row[9] for row in rows] == ["optimal"] * 8
+    assert [float(row[10]) for row in rows] == [decision.objective for decision in run.decisions]
+    assert list(tmp_path.iterdir()) == [tmp_path / "run.csv"]
+
+
+# The first case study
+
+
+def test_on_the_identified_tank_the_alternating_method_moves_far_less_and_tracks_nearly_as_well():
+    problem = tank_problem(identified_tank())
+    rules = mampc.MoveRules(max_moves=3, sparsity_horizon=3)
+    mpc, sparse = (
+        mampc.simulate(TANK, mampc.Regulator(controller), tank_reference(), noise=0.1, seed=0).metrics()
+        for controller in (mampc.MPC(problem), mampc.MAMPC(problem, rules))
+    )
+    assert (mpc.exact_density > 0.95).all()
+    assert ((mpc.sparse_density > 0.3) & (mpc.sparse_density < 0.8)).all()
+    assert (sparse.sparse_density < 0.75 * mpc.sparse_density).all()
+    assert 1.05 < sparse.tracking_error / mpc.tracking_error < 1.30

@@ -1,0 +1,500 @@
+"""Subspace identification against known systems, GNU Octave, SLICOT and nfoursid."""
+
+import importlib
+import os
+import subprocess
+import sys
+import textwrap
+from functools import lru_cache
+
+import ctrlsys
+import numpy as np
+import pandas as pd
+import pytest
+from nfoursid.nfoursid import NFourSID
+
+import mampc
+from identification_records import load_record
+from mampc import IOData, MampcError, StateSpace, n4sid, prbs, validate
+from mampc.identification.validation import whiteness
+
+WEIGHTINGS = ("cva", "n4sid", "moesp")
+SIZES = [(2, 1, 1), (4, 2, 2), (5, 2, 3)]  # states, inputs, outputs
+
+
+def real_form(poles):
+    """A matrix with the given poles; a complex one stands for its conjugate too."""
+    blocks = [[[p.real, p.imag], [-p.imag, p.real]] if p.imag else [[p.real]] for p in map(complex, poles)]
+    size = sum(map(len, blocks))
+    A, at = np.zeros((size, size)), 0
+    for block in blocks:
+        A[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return A
+
+
+def system_with(poles, seed, m=2, l=2, *, feedthrough=True):
+    rng = np.random.default_rng(seed)
+    A = real_form(poles)
+    n = len(A)
+    T = np.eye(n) + 0.3 * rng.standard_normal((n, n))
+    B, C = rng.standard_normal((n, m)), rng.standard_normal((l, n))
+    D = rng.standard_normal((l, m)) if feedthrough else None
+    return StateSpace(T @ A @ np.linalg.inv(T), B, C, D, 1.0, u_op=rng.standard_normal(m))
+
+
+@lru_cache
+def random_system(seed, n, m, l, feedthrough):
+    rng = np.random.default_rng([seed, n])
+    poles = []
+    while n > 0:
+        radius, angle = rng.uniform(0.4, 0.95), rng.uniform(0.3, 2.5)
+        paired = n > 1 and rng.random() < 0.5
+        poles.append(radius * np.exp(1j * angle) if paired else radius * rng.choice([1, 1, -1]))
+        n -= 2 if paired else 1
+    return system_with(poles, seed, m, l, feedthrough=feedthrough)
+
+
+def markov(model, count=20):
+    """D, CB, CAB, ...: the same in all state coordinates."""
+    parameters, column = [model.D], model.B
+    for _ in range(count):
+        parameters.append(model.C @ column)
+        column = model.A @ column
+    return np.array(parameters)
+
+
+def noise_free(system, seed, *, samples=600, at_rest_on_average=True):
+    """A record with a transient from a random initial state.
+
+    The means of a record are an operating point only where its transient sums to none; this is arranged
+    here by correcting the initial state, unless `at_rest_on_average` is False.
+    """
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((samples, system.n_inputs))
+    u += system.u_op - u.mean(axis=0)
+    x0 = 3 * rng.standard_normal(system.n_states)
+    if at_rest_on_average:
+        free = sum(system.C @ np.linalg.matrix_power(system.A, k) for k in range(samples))
+        x0 -= np.linalg.pinv(free) @ (system.response(u, x0) - system.y_op).sum(axis=0)
+    return IOData(u, system.response(u, x0), system.dt)
+
+
+def assert_same_dynamics(model, system):
+    np.testing.assert_allclose(markov(model), markov(system), atol=1e-6 * np.max(np.abs(markov(system))))
+
+
+def assert_same_record(fitted, data):
+    simulated = fitted.model.response(data.u, fitted.x0)
+    np.testing.assert_allclose(simulated, data.y, atol=1e-6 * np.max(np.abs(data.y)))
+    np.testing.assert_allclose(fitted.fit, 100, atol=1e-4)
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("feedthrough", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_noise_free_record_gives_back_system_order_and_transient(seed, size, feedthrough, weighting):
+    system = random_system(seed, *size, feedthrough)
+    data = noise_free(system, seed)
+    fitted = n4sid(data, weighting=weighting)
+    assert fitted.order == system.n_states
+    assert not fitted.stabilised
+    assert_same_dynamics(fitted.model, system)
+    assert_same_record(fitted, data)
+    without_transient = fitted.model.response(data.u)
+    assert np.max(np.abs(without_transient - data.y)) > 0.1
+
+
+@pytest.mark.parametrize("feedthrough", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_transient_that_shifts_the_means_disturbs_neither_order_nor_dynamics(seed, size, feedthrough):
+    system = random_system(seed, *size, feedthrough)
+    fitted = n4sid(noise_free(system, seed, at_rest_on_average=False))
+    assert fitted.order == system.n_states
+    assert_same_dynamics(fitted.model, system)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="the model rests at the means of the record, to which a transient adds"
+)
+@pytest.mark.parametrize("size", SIZES)
+def test_a_transient_that_shifts_the_means_is_recovered(size):
+    data = noise_free(random_system(0, *size, True), 0, at_rest_on_average=False)
+    assert_same_record(n4sid(data), data)
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+def test_without_feedthrough_D_is_zero(weighting):
+    system = random_system(0, 4, 2, 2, False)
+    data = noise_free(system, 0)
+    fitted = n4sid(data, weighting=weighting, feedthrough=False)
+    assert np.array_equal(fitted.model.D, np.zeros((2, 2)))
+    assert_same_dynamics(fitted.model, system)
+    assert_same_record(fitted, data)
+
+
+def test_the_result_describes_the_record():
+    system = random_system(1, 4, 2, 2, True)
+    data = noisy_record(system, 1)[0]
+    fitted = n4sid(data, block_rows=8)
+    assert (fitted.model.dt, fitted.model.names.inputs) == (data.dt, data.names.inputs)
+    assert fitted.singular_values.shape == (16,)
+    assert (np.diff(fitted.singular_values) <= 0).all()
+    assert (fitted.singular_values <= 1 + 1e-9).all()
+    assert fitted.model.n_states == len(fitted.x0) == fitted.order
+    np.testing.assert_array_equal(fitted.fit, fitted.validate(data).fit)
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+def test_units_of_the_inputs_do_not_matter(weighting):
+    data = noisy_record(random_system(1, 4, 2, 2, True), 1)[0]
+    scale = np.array([1e-4, 1e5])
+    scaled = IOData(data.u * scale, data.y, data.dt)
+    fitted, other = (n4sid(record, weighting=weighting, order=4) for record in (data, scaled))
+    np.testing.assert_allclose(other.fit, fitted.fit, atol=1e-6)
+    np.testing.assert_allclose(markov(other.model) * scale, markov(fitted.model), atol=1e-6)
+
+
+def test_units_of_the_outputs_do_not_matter_to_canonical_correlations():
+    data = noisy_record(random_system(1, 4, 2, 2, True), 1)[0]
+    scale = np.array([1e-2, 1e2])
+    fitted, other = n4sid(data, order=4), n4sid(IOData(data.u, data.y * scale, data.dt), order=4)
+    np.testing.assert_allclose(other.singular_values[:4], fitted.singular_values[:4], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["hair_dryer", "glass_furnace"])
+def test_singular_values_and_poles_are_those_of_octave(name):
+    record = load_record(name)
+    fitted = n4sid(
+        record.estimation,
+        order=record.order,
+        weighting="n4sid",
+        block_rows=record.block_rows,
+        unstable="refuse",
+    )
+    np.testing.assert_allclose(fitted.singular_values, record.singular_values, rtol=1e-6)
+    poles = np.sort_complex(fitted.model.poles())
+    np.testing.assert_allclose(poles, np.sort_complex(record.poles), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "margin"), [("hair_dryer", [2]), ("glass_furnace", [2, 2, 2, 15, 15, 15])], ids=lambda v: str(v)
+)
+@pytest.mark.parametrize(
+    ("weighting", "own_block_rows"), [("n4sid", False), ("cva", False), ("n4sid", True), ("cva", True)]
+)
+def test_unseen_plant_data_is_explained_as_well_as_by_octave(
+    name, margin, weighting, own_block_rows, request
+):
+    if (name, weighting) == ("glass_furnace", "cva"):
+        reason = (
+            "canonical variates of 9 signals explain two of the six outputs worse, most with 15 block rows"
+        )
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+    record = load_record(name)
+    block_rows = None if own_block_rows else record.block_rows
+    fitted = n4sid(record.estimation, order=record.order, weighting=weighting, block_rows=block_rows)
+    fit = validate(fitted.model, record.validation).fit
+    print(f"\n{name}, {weighting}: {fit.round(1)}, Octave {record.fit.round(1)}")
+    assert (fit >= record.fit - margin).all()
+
+
+def noisy_record(system, seed, *, samples=1500):
+    """An estimation record at 20 dB signal to noise and a noise-free one to hold out."""
+    rng = np.random.default_rng(seed)
+    n, m = system.n_states, system.n_inputs
+    u = prbs(order=9, hold=3, inputs=m, samples=samples, seed=seed)
+    y = system.response(u, 3 * rng.standard_normal(n))
+    y += 0.1 * y.std(axis=0) * rng.standard_normal(y.shape)
+    unseen = prbs(order=10, hold=3, inputs=m, samples=samples, seed=seed)
+    held_out = IOData(unseen, system.response(unseen, 3 * rng.standard_normal(n)), system.dt)
+    return IOData(u, y, system.dt), held_out
+
+
+def by_slicot(data, order, block_rows):
+    """A and C of SLICOT's N4SID, B and D by its least squares on the simulation error."""
+    (m, l), F = (data.u.shape[1], data.y.shape[1]), np.asfortranarray
+    u, y = data.u - data.u.mean(axis=0), data.y - data.y.mean(axis=0)
+    _, R, _, _, info = ctrlsys.ib01ad(
+        "N", "C", "N", "O", "N", "N", block_rows, m, l, F(u), F(y), 0.0, -1.0
+    )  # fmt: skip
+    assert info == 0
+    A, C, *_, info = ctrlsys.ib01bd("N", "C", "N", block_rows, order, m, l, len(u), R, 0.0)
+    assert info == 0
+    B, D = np.zeros((order, m), order="F"), np.zeros((l, m), order="F")
+    _, B, D, *_, info = ctrlsys.ib01cd("X", "C", "D", order, m, l, F(A), B, F(C), D, F(u), F(y), 0.0)
+    assert info == 0
+    return StateSpace(A, B, C, D, data.dt, data.u.mean(axis=0), data.y.mean(axis=0))
+
+
+def by_nfoursid(data, order, block_rows):
+    inputs, outputs = list(data.names.inputs), list(data.names.outputs)
+    u, y = data.u - data.u.mean(axis=0), data.y - data.y.mean(axis=0)
+    frame = pd.DataFrame(np.hstack([u, y]), columns=inputs + outputs)
+    program = NFourSID(frame, outputs, inputs, num_block_rows=block_rows)
+    program.subspace_identification()
+    model, _ = program.system_identification(rank=order)
+    return StateSpace(model.a, model.b, model.c, model.d, data.dt, data.u.mean(axis=0), data.y.mean(axis=0))
+
+
+SIMULATED = {
+    "overdamped": (0.95, 0.85, 0.6, 0.3),
+    "one resonance": (0.93 * np.exp(0.4j), 0.8, 0.5),
+    "two resonances": (0.95 * np.exp(0.25j), 0.8 * np.exp(1.2j)),
+}
+METHODS = {
+    "default": lambda data: n4sid(data).model,
+    "order 4": lambda data: n4sid(data, order=4).model,
+    "SLICOT": lambda data: by_slicot(data, 4, 15),
+    "nfoursid": lambda data: by_nfoursid(data, 4, 15),
+}
+
+
+@lru_cache
+def median_fits(name):
+    """Per method, the median over six records of the hold-out fit."""
+    system = system_with(SIMULATED[name], seed=100)
+    records = [noisy_record(system, seed) for seed in range(6)]
+    medians = {
+        method: float(np.median([validate(identify(data), unseen).fit.mean() for data, unseen in records]))
+        for method, identify in METHODS.items()
+    }
+    print(f"\n{name}:", ", ".join(f"{method} {median:.2f}" for method, median in medians.items()))
+    return medians
+
+
+@pytest.mark.parametrize("method", ["default", "order 4"])
+@pytest.mark.parametrize("name", SIMULATED)
+def test_unseen_data_is_explained_better_than_by_other_programs(name, method, request):
+    if (name, method) == ("overdamped", "default"):
+        reason = "the weakest of the four modes, 1.3 % of the strongest in energy, is not counted"
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+    medians = median_fits(name)
+    assert medians[method] >= max(medians["SLICOT"], medians["nfoursid"])
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+def test_a_record_taken_in_small_parts_gives_the_same_model(monkeypatch, weighting):
+    data = noisy_record(random_system(1, 4, 2, 2, True), 1)[0]
+    whole = n4sid(data, weighting=weighting)
+    monkeypatch.setattr(importlib.import_module("mampc.identification.n4sid"), "_CHUNK", 97)
+    parts = n4sid(data, weighting=weighting)
+    np.testing.assert_allclose(parts.singular_values, whole.singular_values, rtol=1e-8)
+    np.testing.assert_allclose(markov(parts.model), markov(whole.model), atol=1e-8)
+
+
+def test_the_initial_state_of_a_long_record_is_fitted_to_all_of_it():
+    slow = StateSpace(np.diag([0.9999, 0.5]), [[0.1], [1.0]], [[1.0, 1.0]], None, 1.0)
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((5000, 1))
+    y = slow.response(u, [2.0, -1.0]) + rng.standard_normal((5000, 1))
+    free = np.stack([slow.response(np.zeros((5000, 1)), x0)[:, 0] for x0 in np.eye(2)], axis=1)
+    expected = np.linalg.lstsq(free, (y - slow.response(u))[:, 0])[0]
+    np.testing.assert_allclose(validate(slow, IOData(u, y, 1.0)).x0, expected, rtol=1e-8)
+
+
+MEMORY_PROBE = """
+    import re
+    from pathlib import Path
+    import numpy as np
+    import mampc
+
+    def peak():
+        # Not getrusage: its peak is inherited from the process that started this one.
+        return int(re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
+
+    def identify(samples):
+        model = mampc.StateSpace(np.diag([0.9, 0.7, 0.5, 0.3]), B, C, None, 1.0)
+        u = mampc.prbs(order=14, hold=3, inputs=2, samples=samples)
+        y = model.response(u) + 0.1 * rng.standard_normal((samples, 2))
+        mampc.n4sid(mampc.IOData(u, y, 1.0))
+        return peak()
+
+    rng = np.random.default_rng(0)
+    B, C = rng.standard_normal((4, 2)), rng.standard_normal((2, 4))
+    identify(1000)
+    print(peak(), identify(12_500), identify(50_000))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of resident memory is read from /proc")
+def test_memory_stays_small_and_grows_at_most_linearly_with_the_record():
+    command = [sys.executable, "-c", textwrap.dedent(MEMORY_PROBE)]
+    one_thread = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=one_thread)
+    before, quarter, whole = map(float, done.stdout.split())
+    print(f"\npeak {before:.0f}, {quarter:.0f}, {whole:.0f} MB")
+    assert whole < 300
+    assert whole - before <= 4 * max(quarter - before, 1)
+
+
+def growing_record():
+    """A slow unstable mode beside a stable one, recorded before it has grown far."""
+    system = StateSpace(np.diag([1.004, 0.6]), [[1.0], [1.0]], [[0.2, 1.0]], None, 1.0)
+    return mampc.excite(system, prbs(order=9), noise=0.05, seed=3)
+
+
+def test_an_unstable_model_is_refused_on_request():
+    with pytest.raises(MampcError, match=r"expected a stable model, received poles of size \[1\.00"):
+        n4sid(growing_record(), order=2, unstable="refuse")
+
+
+def test_stabilising_mirrors_poles_and_says_so():
+    fitted = n4sid(growing_record(), order=2)
+    assert fitted.stabilised
+    assert fitted.model.is_stable()
+    np.testing.assert_allclose(np.abs(fitted.model.poles()).max(), 1 / 1.004, atol=0.002)
+    assert np.isfinite(fitted.fit).all()
+
+
+@pytest.mark.parametrize(
+    ("samples", "options", "message"),
+    [
+        (8, {}, "expected at least 11 samples .* received 8"),
+        (40, {"order": 12}, "expected at least 77 samples .* order 12, received 40"),
+        (300, {"order": 200}, "expected at least .* received 300"),
+        (300, {"order": 0}, "order: expected a whole number of at least 1, received 0"),
+        (300, {"order": 2.0}, r"order: expected a whole number .* received 2\.0"),
+        (
+            300,
+            {"order": 12, "block_rows": 5},
+            "block_rows: expected a whole number of at least 13, received 5",
+        ),
+        (300, {"block_rows": 1}, "block_rows: expected a whole number of at least 2, received 1"),
+        (300, {"block_rows": 51}, "block_rows: expected at most 50 for 300 samples, received 51"),
+        (300, {"weighting": "best"}, "weighting: expected one of .* received 'best'"),
+        (300, {"unstable": "ignore"}, "unstable: expected 'stabilise' or 'refuse', received 'ignore'"),
+    ],
+)
+def test_impossible_requests_are_refused(samples, options, message):
+    rng = np.random.default_rng(0)
+    data = IOData(rng.standard_normal(samples), rng.standard_normal(samples), 1.0)
+    with pytest.raises(MampcError, match=message):
+        n4sid(data, **options)
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize(("m", "l"), [(1, 1), (2, 2), (1, 3)])
+def test_records_are_identified_from_a_least_length_on(m, l, weighting):
+    rng = np.random.default_rng(0)
+    least = 4 * (m + l + 1) - 1
+    for samples in range(1, least + 20):
+        data = IOData(rng.standard_normal((samples, m)), rng.standard_normal((samples, l)), 1.0)
+        if samples < least:
+            with pytest.raises(MampcError, match=f"expected at least {least} samples"):
+                n4sid(data, weighting=weighting)
+        else:
+            assert np.isfinite(n4sid(data, weighting=weighting).model.A).all()
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("constant", ["u1", "u2", "y1", "y2"])
+def test_a_constant_signal_is_refused_by_name(constant, weighting):
+    signals = dict(
+        zip(("u1", "u2", "y1", "y2"), np.random.default_rng(0).standard_normal((4, 300)), strict=True)
+    )
+    signals[constant] = np.full(300, 0.1)
+    data = IOData(
+        np.stack([signals["u1"], signals["u2"]], 1), np.stack([signals["y1"], signals["y2"]], 1), 1.0
+    )
+    with pytest.raises(MampcError, match=f"expected signals that vary, received constant {constant}"):
+        n4sid(data, weighting=weighting)
+
+
+@pytest.mark.parametrize(
+    "u", [np.tile(prbs(order=3), (60, 1)), np.sin(0.1 * np.arange(400)), np.repeat(prbs(order=8), 2, axis=1)]
+)
+def test_inputs_that_excite_too_little_are_refused(u):
+    y = np.random.default_rng(0).standard_normal(len(u))
+    with pytest.raises(MampcError, match="expected inputs that excite"):
+        n4sid(IOData(u, y, 1.0))
+
+
+@lru_cache
+def tank_record(seed):
+    u = prbs(order=8, amplitude=25, hold=5, mean=[50, 50], seed=seed)
+    return mampc.excite(mampc.plants.QuadrupleTank(), u, dt=10, noise=0.1, seed=1)
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_the_tank_is_four(seed, weighting):
+    fitted = n4sid(tank_record(seed), weighting=weighting)
+    assert fitted.order == 4
+    assert (fitted.fit > 85).all()
+
+
+def test_a_model_explains_its_own_simulation_from_any_state():
+    system = random_system(2, 5, 2, 3, True)
+    data = noise_free(system, 7, at_rest_on_average=False)
+    result = validate(system, data)
+    np.testing.assert_allclose(result.fit, 100, atol=1e-9)
+    np.testing.assert_allclose(result.y_hat, data.y, atol=1e-10)
+    np.testing.assert_allclose(system.response(data.u, result.x0), data.y, atol=1e-10)
+
+
+def test_the_fit_is_that_of_its_definition():
+    data, _ = noisy_record(random_system(2, 4, 2, 2, True), 0)
+    result = validate(random_system(3, 4, 2, 2, True), data)
+    assert np.array_equal(result.residuals, data.y - result.y_hat)
+    error = np.linalg.norm(result.residuals, axis=0)
+    spread = np.linalg.norm(data.y - data.y.mean(axis=0), axis=0)
+    np.testing.assert_allclose(result.fit, 100 * (1 - error / spread))
+
+
+def test_no_other_initial_state_fits_better():
+    system = random_system(2, 4, 2, 2, True)
+    data = noisy_record(system, 0)[0][:40]
+    result = validate(system, data)
+    least = np.sum(result.residuals**2)
+    for direction in np.eye(4):
+        for step in (-1e-3, 1e-3):
+            assert np.sum((data.y - system.response(data.u, result.x0 + step * direction)) ** 2) > least
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (
+            IOData(np.zeros((9, 2)), np.zeros((9, 2)), 2.0),
+            "expected a record sampled every 1 s, received 2 s",
+        ),
+        (
+            IOData(np.zeros((9, 1)), np.zeros((9, 2)), 1.0),
+            "expected 2 inputs and 2 outputs, received 1 and 2",
+        ),
+        (
+            IOData(np.zeros((9, 2)), np.zeros((9, 3)), 1.0),
+            "expected 2 inputs and 2 outputs, received 2 and 3",
+        ),
+    ],
+)
+def test_a_record_that_does_not_belong_to_the_model_is_refused(data, message):
+    with pytest.raises(MampcError, match=message):
+        validate(random_system(0, 4, 2, 2, True), data)
+
+
+def test_white_residuals_pass_the_whiteness_test_as_often_as_its_level_says():
+    p = whiteness(np.random.default_rng(0).standard_normal((500, 400)))
+    assert 0.02 < np.mean(p < 0.05) < 0.09
+    assert 0.4 < np.median(p) < 0.6
+
+
+def test_coloured_residuals_fail_the_whiteness_test():
+    noise = np.random.default_rng(1).standard_normal((500, 3))
+    moving_average = noise[1:] + 0.7 * noise[:-1]
+    drifting = np.cumsum(noise, axis=0)[1:]
+    assert (whiteness(np.hstack([moving_average, drifting])) < 1e-6).all()
+
+
+def test_residuals_that_vanish_count_as_white():
+    assert np.array_equal(whiteness(np.zeros((50, 2))), [1.0, 1.0])
+
+
+def test_the_residuals_of_the_true_system_are_white_and_those_of_a_wrong_one_are_not():
+    system = random_system(1, 4, 2, 2, True)
+    data = noisy_record(system, 1)[0]
+    assert (validate(system, data).whiteness > 0.01).all()
+    assert (n4sid(data, order=1).validate(data).whiteness < 1e-6).all()

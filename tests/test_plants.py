@@ -1,0 +1,174 @@
+"""The quadruple tank: its operating point, its zeros, and levels that cannot be negative."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mampc import MampcError, linearise
+from mampc.plants import Plant, QuadrupleTank, advance
+
+TANK = QuadrupleTank()
+PERCENT = st.floats(0, 100)
+LEVELS = st.lists(st.floats(0, 40), min_size=4, max_size=4).map(np.array)
+
+
+def test_the_tank_is_a_plant():
+    assert isinstance(TANK, Plant)
+
+
+def test_half_open_valves_give_the_levels_of_the_paper():
+    np.testing.assert_allclose(TANK.steady_state([50, 50]), [16.36, 13.68, 5.92, 8.09], atol=0.1)
+    np.testing.assert_allclose(TANK.steady_state(), [16.3, 13.7, 6.0, 8.1], atol=0.1)
+    np.testing.assert_allclose(TANK.output(TANK.steady_state()), [32.6, 27.4], atol=0.2)
+
+
+@given(PERCENT, PERCENT)
+@settings(deadline=None)
+def test_nothing_moves_at_the_steady_state(u1, u2):
+    rate = TANK.derivative(TANK.steady_state([u1, u2]), [u1, u2])
+    np.testing.assert_allclose(rate, 0, atol=1e-12)
+
+
+@given(LEVELS, PERCENT, PERCENT)
+@settings(deadline=None)
+def test_volume_is_conserved(levels, u1, u2):
+    """What the pumps deliver, less what leaves the lower tanks, is what the four tanks gain."""
+    gained = np.sum(np.array(TANK.areas) * TANK.derivative(levels, [u1, u2]))
+    delivered = TANK.k_pump[0] * u1 + TANK.k_pump[1] * u2
+    left = np.sum(np.array(TANK.outlets)[:2] * np.sqrt(2 * TANK.gravity * levels[:2]))
+    np.testing.assert_allclose(gained, delivered - left, atol=1e-9)
+
+
+def test_batches_are_evaluated_as_one_by_one():
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(0, 30, (3, 5, 4)), rng.uniform(0, 100, (3, 5, 2))
+    rates, outputs, rests = TANK.derivative(x, u), TANK.output(x, u), TANK.steady_state(u)
+    assert (rates.shape, outputs.shape, rests.shape) == ((3, 5, 4), (3, 5, 2), (3, 5, 4))
+    for i in np.ndindex(3, 5):
+        assert np.array_equal(rates[i], TANK.derivative(x[i], u[i]))
+        assert np.array_equal(outputs[i], TANK.output(x[i], u[i]))
+        assert np.array_equal(rests[i], TANK.steady_state(u[i]))
+
+
+def test_one_input_serves_a_batch_of_states():
+    x = np.random.default_rng(0).uniform(0, 30, (6, 4))
+    u = np.array([40.0, 60.0])
+    assert np.array_equal(TANK.derivative(x, u), TANK.derivative(x, np.tile(u, (6, 1))))
+
+
+@pytest.mark.parametrize("dt", [0.5, 10.0, 100.0])
+def test_levels_never_fall_below_zero_when_draining(dt):
+    x = TANK.steady_state()
+    lowest = []
+    for _ in range(150):
+        x = advance(TANK, x, np.zeros(2), dt)
+        assert np.isfinite(x).all()
+        lowest.append(x.min())
+    assert min(lowest) >= -1e-8  # cm: the integrator's tolerance
+    assert (TANK.output(x) >= 0).all()
+
+
+def test_an_empty_tank_stays_empty_and_a_negative_input_does_not_pump_back():
+    assert np.array_equal(TANK.derivative(np.zeros(4), np.zeros(2)), np.zeros(4))
+    assert np.array_equal(TANK.derivative(np.zeros(4), [-10.0, -10.0]), np.zeros(4))
+    assert (TANK.derivative([-1e-9] * 4, [0.0, 0.0]) >= 0).all()
+
+
+def test_two_half_steps_are_one_step():
+    x, u = np.array([5.0, 10.0, 2.0, 3.0]), np.array([70.0, 30.0])
+    halves = advance(TANK, advance(TANK, x, u, 5.0), u, 5.0)
+    np.testing.assert_allclose(halves, advance(TANK, x, u, 10.0), rtol=1e-6)
+
+
+def test_the_steady_state_is_reached_from_empty_tanks():
+    x = advance(TANK, np.zeros(4), np.array([50.0, 50.0]), 3000.0)
+    np.testing.assert_allclose(x, TANK.steady_state(), rtol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("rate", [np.square, lambda x: 200 * x, lambda x: x * np.nan, lambda x: x / 0.0])
+def test_a_plant_that_blows_up_is_reported(rate):
+    class Explosive(QuadrupleTank):
+        def derivative(self, x, u):
+            return rate(x)
+
+    with pytest.raises(MampcError, match="Explosive: the integration failed"), np.errstate(all="ignore"):
+        advance(Explosive(), np.ones(4), np.zeros(2), 10.0)
+
+
+def test_most_flow_through_the_upper_tanks_makes_a_non_minimum_phase_zero():
+    zeros = linearise(TANK).zeros()
+    assert np.isreal(zeros).all()
+    assert np.sum(zeros.real > 0) == 1
+    np.testing.assert_allclose(zeros.real.max(), 0.034, atol=0.001)
+
+
+@pytest.mark.parametrize(
+    ("gamma", "minimum_phase"), [((0.7, 0.7), True), ((0.6, 0.5), True), ((0.5, 0.4), False)]
+)
+def test_the_sign_of_the_zero_follows_the_sum_of_the_splits(gamma, minimum_phase):
+    zeros = linearise(replace(TANK, gamma=gamma)).zeros()
+    assert (zeros.real < 0).all() == minimum_phase
+
+
+@pytest.mark.parametrize("u", [(50.0, 50.0), (20.0, 80.0)])
+def test_the_linearisation_matches_the_jacobian_by_hand(u):
+    model = linearise(TANK, u)
+    areas, (g1, g2), (k1, k2) = np.array(TANK.areas), TANK.gamma, TANK.k_pump
+    leak = np.array(TANK.outlets) * np.sqrt(TANK.gravity / (2 * TANK.steady_state(u)))
+    A = np.diag(-leak / areas)
+    A[0, 2], A[1, 3] = leak[2] / areas[0], leak[3] / areas[1]
+    B = np.array([[g1 * k1, 0], [0, g2 * k2], [0, (1 - g2) * k2], [(1 - g1) * k1, 0]]) / areas[:, None]
+    np.testing.assert_allclose(model.A, A, atol=1e-9)
+    np.testing.assert_allclose(model.B, B, atol=1e-9)
+    np.testing.assert_allclose(model.C, TANK.k_c * np.eye(2, 4), atol=1e-8)
+    np.testing.assert_allclose(model.D, np.zeros((2, 2)), atol=1e-12)
+    np.testing.assert_allclose(model.u_op, u)
+    np.testing.assert_allclose(model.y_op, TANK.output(TANK.steady_state(u)))
+    assert model.names == TANK.names
+
+
+@given(st.floats(10, 90), st.floats(10, 90))
+@settings(max_examples=25, deadline=None)
+def test_the_tank_is_stable_at_every_operating_point(u1, u2):
+    assert linearise(TANK, [u1, u2]).is_stable()
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"areas": (730.0, 730.0)},
+        {"areas": (730.0, 730.0, 0.0, 730.0)},
+        {"outlets": (2.0, 2.0, 2.0, -1.0)},
+        {"outlets": (2.0, 2.0, 2.0, np.nan)},
+        {"gravity": 0.0},
+        {"gravity": "strong"},
+        {"k_c": -2.0},
+        {"k_c": np.inf},
+        {"gamma": (1.2, 0.3)},
+        {"gamma": (0.3, -0.1)},
+        {"gamma": (0.3, 0.3, 0.3)},
+        {"k_pump": (0.0, 7.0)},
+        {"u_op": (50.0, 50.0, 50.0)},
+        {"u_op": (-1.0, 50.0)},
+    ],
+    ids=repr,
+)
+def test_impossible_parameters_are_refused(parameters):
+    with pytest.raises(MampcError, match=rf"{next(iter(parameters))}: expected .* received"):
+        QuadrupleTank(**parameters)
+
+
+@pytest.mark.parametrize("u", [[-1.0, 50.0], [np.nan, 50.0], [50.0], 50.0, [1.0, 2.0, 3.0]])
+def test_no_steady_state_exists_for_impossible_inputs(u):
+    with pytest.raises(MampcError, match=r"expected inputs .* received"):
+        TANK.steady_state(u)
+
+
+@pytest.mark.parametrize("parameter", fields(QuadrupleTank), ids=lambda parameter: parameter.name)
+def test_every_parameter_documents_its_unit_and_source(parameter):
+    assert parameter.metadata["unit"]
+    assert len(parameter.metadata["source"]) > 10

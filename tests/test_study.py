@@ -1,0 +1,192 @@
+"""Study files: what is accepted, what is refused and how, and what comes of a run."""
+
+import json
+
+import numpy as np
+import pytest
+
+import mampc
+from mampc.report.output import published_together, write_study
+from mampc.report.summary import summarise
+from mampc.study import builtin_studies, load_study, parse_study, run_study, template
+
+SHORT = template().replace("steps = 145", "steps = 20").replace("prbs_order = 8", "prbs_order = 6")
+SHORT = SHORT.replace("at = 50", "at = 12").replace("at = 100", "at = 16")
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run_study(parse_study(SHORT))
+
+
+def test_the_template_is_the_built_in_study():
+    assert "quadruple-tank" in builtin_studies()
+    assert parse_study(template()) == load_study("quadruple-tank")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "named", "expected"),
+    [
+        ("steps = 145", 'steps = "many"', "steps", "integer"),
+        ("steps = 145", "steps = 145.5", "steps", "integer"),
+        ("steps = 145", "steps = 0", "steps", "greater than or equal to 1"),
+        ('dt = "10 s"', 'dt = "10 kg"', "dt", "units ms, s, min, h"),
+        ('dt = "10 s"', 'dt = "soon"', "dt", "10 s"),
+        ('dt = "10 s"', "dt = -1", "dt", "greater than 0"),
+        (
+            "prediction_horizon",
+            "predicton_horizon",
+            "problem.predicton_horizon",
+            "mean 'prediction_h",
+        ),
+        ("{ u_min = 0.0", "{ umin = 0.0", "problem.limits.umin", "'u_min'"),
+        ('kind = "quadruple-tank"', 'kind = "octuple-tank"', "plant.kind", "quadruple-tank"),
+        ("move_weight = 0.1", 'move_weight = "big"', "problem.move_weight", "number"),
+        ("move_weight = 0.1", "move_weight = nan", "problem.move_weight", "finite"),
+        ("max_moves = 3", "max_moves = 3.5", "controllers[1].rules.max_moves", "integer"),
+        ("max_moves = 3", "max_moves = -1", "controllers[1].rules.max_moves", "greater than or equal to 0"),
+        ('method = "mpc"', 'method = "magic"', "controllers[0]", "alternating"),
+        ("noise = 0.0", 'noise = "loud"', "scenarios[0].noise", "number"),
+        ("{ at = 5,", "{ at = -5,", "reference.changes[0].at", "greater than or equal to 0"),
+        ("[plant]", "[plnt]", "plnt", "'plant'"),
+        ("skip = 15", "skip = 145", "skip", "below the 145 steps"),
+        ('name = "noisy"', 'name = "Noise free"', "scenarios", "names that differ"),
+    ],
+)
+def test_a_wrong_key_type_or_unit_is_named_with_its_place(right, wrong, named, expected):
+    assert right in template()
+    with pytest.raises(mampc.StudyError) as complaint:
+        parse_study(template().replace(right, wrong, 1), "my-study.toml")
+    message = str(complaint.value)
+    assert "my-study.toml" in message
+    assert named in message
+    assert expected in message
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "expected"),
+    [
+        ("control_horizon = 5", "control_horizon = 11", "control_horizon"),
+        ("u_min = 0.0", "u_min = 200.0", "u_min <= u_max"),
+        ("u_max = 100.0", "u_max = [1.0, 2.0, 3.0]", "received shape"),
+        ("initial = [0.0, 0.0]", "initial = [0.0]", "values"),
+        ("# parameters = { gamma = [0.3, 0.3] }", "parameters = { gama = 1 }", "gama"),
+        ("# parameters = { gamma = [0.3, 0.3] }", "parameters = { gamma = [2.0, 0.3] }", "within 0..1"),
+        ("settings = { penalty = 10.0 }", "settings = { penality = 10.0 }", "penality"),
+        ("settings = { penalty = 10.0 }", "settings = { penalty = -1.0 }", "penalty"),
+        ("amplitude = 25.0", "amplitude = [1.0, 2.0, 3.0]", "amplitude"),
+    ],
+)
+def test_values_that_do_not_fit_together_are_refused(right, wrong, expected):
+    assert right in SHORT
+    with pytest.raises(mampc.MampcError, match=expected):
+        run_study(parse_study(SHORT.replace(right, wrong, 1)))
+
+
+def test_times_have_units():
+    assert parse_study(template().replace('"10 s"', '"0.5 min"')).dt == 30.0
+    assert parse_study(template().replace('"10 s"', "12")).dt == 12.0
+
+
+def test_text_that_is_not_toml_is_refused():
+    with pytest.raises(mampc.StudyError, match="TOML"):
+        parse_study("name = ")
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(mampc.StudyError, match="quadruple-tank"):
+        load_study(tmp_path / "none.toml")
+
+
+def test_an_unstable_loop_is_warned_of():
+    study = parse_study(SHORT.replace('dt = "10 s"', "dt = 5.0"))
+    assert any("unstable" in warning for warning in run_study(study).warnings)
+
+
+def test_every_controller_sees_the_same_noise(result):
+    runs = result.runs["noisy"].values()
+    noise = [run.y_measured - run.y for run in runs]
+    for other in noise[1:]:
+        np.testing.assert_allclose(other, noise[0], atol=1e-12)
+    assert np.std(noise[0]) == pytest.approx(0.1, rel=0.5)
+
+
+def test_a_noise_free_run_rests_until_the_reference_moves(result):
+    run = result.runs["noise-free"]["MPC"]
+    np.testing.assert_allclose(run.u[:5], 50.0, atol=1e-6)
+    np.testing.assert_allclose(run.y[:5], run.r[:5], atol=1e-6)
+
+
+def test_the_summary_holds_what_is_promised(result):
+    summary = json.loads(json.dumps(summarise(result), allow_nan=False))
+    assert {"study", "steps", "dt", "scenarios"} <= set(summary)
+    assert [scenario["name"] for scenario in summary["scenarios"]] == ["noise-free", "noisy"]
+    for scenario in summary["scenarios"]:
+        assert [entry["name"] for entry in scenario["controllers"]] == ["MPC", "MAMPC ns=1", "MAMPC ns=3"]
+        for entry in scenario["controllers"]:
+            for part in (entry, entry["without_transient"]):
+                assert part["sparse_density"]["threshold"] == 0.1
+                assert len(part["sparse_density"]["per_input"]) == 2
+                assert len(part["sparse_density"]["exact_per_input"]) == 2
+                assert part["tracking_error"] >= 0
+            assert entry["without_transient"]["skipped"] == 15
+            assert {"median", "p99", "max"} == set(entry["solve_time_us"])
+            assert sum(entry["status"].values()) == 20
+            assert len(entry["travel_per_input"]) == 2
+            assert entry["moves"] == sum(entry["moves_per_input"])
+
+
+def test_the_files_of_a_run_can_be_read_back(result, tmp_path):
+    summary, missing = write_study(result, tmp_path / "out")
+    assert missing is None
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
+    model = mampc.StateSpace.load(tmp_path / "out" / "model.json")
+    np.testing.assert_array_equal(model.A, result.model.A)
+    trajectory = np.genfromtxt(tmp_path / "out" / "noisy-mpc.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(trajectory["u1"], result.runs["noisy"]["MPC"].u[:, 0])
+    for name in ("prbs-inputs", "prbs-outputs", "noisy-u1", "noisy-y2", "noisy-moves-against-error"):
+        for kind in ("png", "svg"):
+            assert (tmp_path / "out" / "figures" / f"{name}.{kind}").stat().st_size > 1000
+
+
+def test_results_appear_whole_or_not_at_all(tmp_path):
+    target = tmp_path / "out"
+    with pytest.raises(RuntimeError), published_together(target) as folder:
+        (folder / "half.csv").write_text("1")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+    target.mkdir()
+    (target / "notes.txt").write_text("mine")
+    (target / "summary.json").write_text("old")
+    with pytest.raises(RuntimeError), published_together(target) as folder:
+        (folder / "summary.json").write_text("new")
+        raise RuntimeError
+    assert (target / "summary.json").read_text() == "old"
+
+    with published_together(target) as folder:
+        (folder / "summary.json").write_text("new")
+    assert (target / "summary.json").read_text() == "new"
+    assert (target / "notes.txt").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_an_identified_model_file_can_be_studied(result, tmp_path):
+    result.model.save(tmp_path / "model.json")
+    before, after = SHORT.index("[identification]"), SHORT.index("[problem]")
+    text = SHORT[:before] + '[model]\nfile = "model.json"\n\n' + SHORT[after:]
+    (tmp_path / "study.toml").write_text(text.replace('kind = "quadruple-tank"', 'kind = "model"'))
+    outcome = run_study(load_study(tmp_path / "study.toml"))
+    assert outcome.identified is None
+    assert outcome.runs["noise-free"]["MPC"].statuses == {"optimal": 20}
+    np.testing.assert_array_equal(outcome.model.A, result.model.A)
+
+
+def test_a_path_outside_the_studys_folder_is_refused(result, tmp_path):
+    result.model.save(tmp_path / "model.json")
+    (tmp_path / "inner").mkdir()
+    before, after = SHORT.index("[identification]"), SHORT.index("[problem]")
+    text = SHORT[:before] + '[model]\nfile = "../model.json"\n\n' + SHORT[after:]
+    (tmp_path / "inner" / "study.toml").write_text(text)
+    with pytest.raises(mampc.StudyError, match="within the study's folder"):
+        run_study(load_study(tmp_path / "inner" / "study.toml"))
