@@ -116,15 +116,6 @@ def test_a_transient_that_shifts_the_means_disturbs_neither_order_nor_dynamics(s
     assert_same_dynamics(fitted.model, system)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the model rests at the means of the record, to which a transient adds"
-)
-@pytest.mark.parametrize("size", SIZES)
-def test_a_transient_that_shifts_the_means_is_recovered(size):
-    data = noise_free(random_system(0, *size, True), 0, at_rest_on_average=False)
-    assert_same_record(n4sid(data), data)
-
-
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
 def test_without_feedthrough_D_is_zero(weighting):
     system = random_system(0, 4, 2, 2, False)
@@ -185,14 +176,7 @@ def test_singular_values_and_poles_are_those_of_octave(name):
 @pytest.mark.parametrize(
     ("weighting", "own_block_rows"), [("n4sid", False), ("cva", False), ("n4sid", True), ("cva", True)]
 )
-def test_unseen_plant_data_is_explained_as_well_as_by_octave(
-    name, margin, weighting, own_block_rows, request
-):
-    if (name, weighting) == ("glass_furnace", "cva"):
-        reason = (
-            "canonical variates of 9 signals explain two of the six outputs worse, most with 15 block rows"
-        )
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+def test_unseen_plant_data_is_explained_as_well_as_by_octave(name, margin, weighting, own_block_rows):
     record = load_record(name)
     block_rows = None if own_block_rows else record.block_rows
     fitted = n4sid(record.estimation, order=record.order, weighting=weighting, block_rows=block_rows)
@@ -267,10 +251,7 @@ def median_fits(name):
 
 @pytest.mark.parametrize("method", ["default", "order 4"])
 @pytest.mark.parametrize("name", SIMULATED)
-def test_unseen_data_is_explained_better_than_by_other_programs(name, method, request):
-    if (name, method) == ("overdamped", "default"):
-        reason = "the weakest of the four modes, 1.3 % of the strongest in energy, is not counted"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+def test_unseen_data_is_explained_better_than_by_other_programs(name, method):
     medians = median_fits(name)
     assert medians[method] >= max(medians["SLICOT"], medians["nfoursid"])
 
@@ -279,7 +260,8 @@ def test_unseen_data_is_explained_better_than_by_other_programs(name, method, re
 def test_a_record_taken_in_small_parts_gives_the_same_model(monkeypatch, weighting):
     data = noisy_record(random_system(1, 4, 2, 2, True), 1)[0]
     whole = n4sid(data, weighting=weighting)
-    monkeypatch.setattr(importlib.import_module("mampc.identification.n4sid"), "_CHUNK", 97)
+    for module in ("n4sid", "realisation"):
+        monkeypatch.setattr(importlib.import_module(f"mampc.identification.{module}"), "_CHUNK", 97)
     parts = n4sid(data, weighting=weighting)
     np.testing.assert_allclose(parts.singular_values, whole.singular_values, rtol=1e-8)
     np.testing.assert_allclose(markov(parts.model), markov(whole.model), atol=1e-8)

@@ -326,7 +326,10 @@ class CondensedQP:
 
 
 def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    array: Array = np.asarray(value, dtype=np.float64)
+    try:
+        array: Array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise MampcError(f"{name}: expected numbers of shape {shape}, received {value!r}") from None
     if array.shape != shape:
         raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
     return array

@@ -17,11 +17,13 @@ import numpy as np
 from mampc.arrays import Array, as_whole
 from mampc.errors import MampcError
 from mampc.identification.data import IOData
-from mampc.identification.triangular import fold, solve
+from mampc.identification.realisation import realise
+from mampc.identification.triangular import fold
 from mampc.identification.validation import Validation, validate
 from mampc.lti import StateSpace
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
+NEAR_BEST = 1.02  # simulation errors that are as good as equal
 _CHUNK = 4096  # Hankel columns taken into the triangular factor at once
 
 
@@ -63,7 +65,8 @@ def n4sid(
 
     Args:
         data: the record.
-        order: n; default chosen from the singular values (see `choose_order`).
+        order: n; by default the singular values say how many orders the record supports, and the
+            smallest of these is taken whose simulation error is within 2 % of the best.
         weighting: "cva" (canonical variates: whitens the future outputs, best with noise), "n4sid" or
             "moesp" (unweighted; the same range in the projected form used here, which is SLICOT's).
         block_rows: s, how many samples past and future hold; default 15, less for short records, more
@@ -91,49 +94,41 @@ def n4sid(
     _require_excitation(R, m, s)
     gamma, singular_values = _observability(R, m, l, s, weighting)
     if order is None:
-        projected, remainder = _projection(R[1:, 1:], m, l, s)
-        energies = np.linalg.svd(projected, compute_uv=False)
-        order = choose_order(_canonical(projected, remainder)[1], energies, len(data), m, l)
-    if order > len(singular_values) - l:
-        raise MampcError(
-            f"order: expected at most {len(singular_values) - l} with {s} block rows, received {order}"
-        )
-    gamma = gamma[:, :order]
-    C = gamma[:l]
-    A = np.linalg.lstsq(gamma[:-l], gamma[l:])[0]  # shift invariance
-    A, stabilised = _inside_unit_circle(A, unstable)
-    B, D = _input_matrices(A, C, u, y, feedthrough)
+        _, correlations = _canonical(*_projection(R[1:, 1:], m, l, s))
+        orders = range(1, supported_order(correlations, len(data) - 2 * s - s * m, m, l, s) + 1)
+    elif order <= len(singular_values) - l:
+        orders = range(order, order + 1)
+    else:
+        most = len(singular_values) - l
+        raise MampcError(f"order: expected at most {most} with {s} block rows, received {order}")
+    candidates = [realise(gamma[:, :n], u, y, feedthrough=feedthrough, unstable=unstable) for n in orders]
+    best = min(candidate.error for candidate in candidates)
+    chosen = next(candidate for candidate in candidates if candidate.error <= NEAR_BEST * best)
     manipulated = len(data.names.inputs)
     model = StateSpace(
-        A, B, C, D, data.dt, u_op[:manipulated], y_op, data.names, v_op=u_op[manipulated:]
+        chosen.A, chosen.B, chosen.C, chosen.D, data.dt, u_op[:manipulated], y_op, data.names,
+        v_op=u_op[manipulated:],
     )  # fmt: skip
     quality = validate(model, data)
-    return Identified(model, quality.x0, singular_values, order, quality.fit, stabilised)
+    return Identified(
+        model, quality.x0, singular_values, model.n_states, quality.fit, chosen.stabilised
+    )  # fmt: skip
 
 
-def choose_order(correlations: Array, energies: Array, samples: int, m: int, l: int) -> int:
-    """The number of modes that matter, among those the record can support.
+def supported_order(correlations: Array, columns: int, m: int, l: int, s: int) -> int:
+    """How many canonical correlations are larger than chance makes them, 1 to 20.
 
-    The record supports orders up to the minimum of rho_{n+1}^2 plus log(N)/N times the number of
-    parameters 2 n l + m (n + l): the singular value criterion of Bauer, Automatica 37 (2001). Among
-    these, modes count whose energy is above 2 % of the largest, and all before the last drop of the
-    energies by a factor of 3: weak modes of a clean record, but not the weak ones into which a nonlinear
-    plant's record fades.
+    Chance reaches up to the edge of Wachter's distribution (Annals of Statistics 8, 1980).
 
     Args:
-        correlations: canonical correlations rho, the singular values of weighting "cva", shape (s * l,).
-        energies: singular values without weighting, shape (s * l,).
-        samples, m, l: length of the record, numbers of inputs and outputs.
-
-    Returns:
-        An order of at least 1.
+        correlations: singular values of the weighting "cva", shape (s * l,).
+        columns: Hankel columns less those that the future inputs take up.
+        m, l, s: numbers of inputs, outputs and block rows.
     """
-    n = np.arange(1, max(2, len(correlations) - l))
-    parameters = 2 * n * l + m * (n + l)
-    most = int(n[np.argmin(correlations[n] ** 2 + np.log(samples) / samples * parameters)])
-    strong = int(np.count_nonzero(energies[:most] > 0.02 * energies[0]))
-    drops = np.flatnonzero(energies[:most] > 3 * energies[1 : most + 1])
-    return max(1, strong, int(drops[-1]) + 1 if len(drops) else 0)
+    past, future = min(1.0, s * (m + l) / columns), min(1.0, s * l / columns)
+    edge = np.sqrt(past * (1 - future)) + np.sqrt(future * (1 - past))
+    counted = int(np.count_nonzero(correlations > edge if past + future < 1 else correlations > 1.0))
+    return max(1, min(counted, len(correlations) - l, 20))
 
 
 def _block_rows(samples: int, m: int, l: int, order: int | None, block_rows: int | None) -> int:
@@ -148,7 +143,7 @@ def _block_rows(samples: int, m: int, l: int, order: int | None, block_rows: int
             f"{'' if order is None else f' and order {order}'}, received {samples}"
         )
     if block_rows is None:
-        return min(max(15, least + 5), most)
+        return max(least, min(max(15, least + 5), samples // (8 * (m + l)), most))
     s = as_whole("block_rows", block_rows, least)
     if s > most:
         raise MampcError(f"block_rows: expected at most {most} for {samples} samples, received {s}")
@@ -210,51 +205,3 @@ def _triangular_factor(u: Array, y: Array, s: int) -> Array:
         hankel = [np.ones((len(U), 1)), *(part.reshape(len(U), -1) for part in parts)]
         R = fold(R, np.concatenate(hankel, axis=1))
     return R
-
-
-def _inside_unit_circle(A: Array, unstable: str) -> tuple[Array, bool]:
-    """A itself, or with each pole outside the unit circle mirrored to 1 / conj(pole)."""
-    poles, vectors = np.linalg.eig(A)
-    outside = np.abs(poles) >= 1.0
-    if not outside.any():
-        return A, False
-    if unstable == "refuse":
-        raise MampcError(
-            f"n4sid: expected a stable model, received poles of size {np.sort(np.abs(poles[outside]))}; "
-            "remove drifts from the record, try another order, or allow unstable='stabilise'"
-        )
-    mirrored = np.where(outside, poles / np.maximum(np.abs(poles), 1.0 + 1e-6) ** 2, poles)
-    stable: Array = np.real(vectors @ np.diag(mirrored) @ np.linalg.inv(vectors))
-    return stable, True
-
-
-def _input_matrices(A: Array, C: Array, u: Array, y: Array, feedthrough: bool) -> tuple[Array, Array]:
-    """B and D by least squares on the simulation error, to which x0 and a constant contribute too.
-
-    Column (i, j) of the response to B is the output of (A, e_i, C) driven by input j.
-    """
-    n, m, l = len(A), u.shape[1], len(C)
-    unknowns = n * m + n + l + (l * m if feedthrough else 0)
-    state = np.zeros((n, n * m + n))
-    state[:, n * m :] = np.eye(n)
-    picks = np.eye(n)
-    normal: Array = np.empty((0, unknowns + 1))
-    for start in range(0, len(u), _CHUNK):
-        block = u[start : start + _CHUNK]
-        rows = np.zeros((len(block), l, unknowns + 1))
-        states = np.empty((len(block), n, n * m + n))
-        for k, inputs in enumerate(block):
-            states[k] = state
-            state = A @ state
-            state[:, : n * m] += np.kron(picks, inputs)
-        rows[:, :, : n * m + n] = C @ states
-        rows[:, :, n * m + n : n * m + n + l] = np.eye(l)
-        if feedthrough:
-            direct = np.einsum("op,kj->kopj", np.eye(l), block)
-            rows[:, :, n * m + n + l : -1] = direct.reshape(len(block), l, l * m)
-        rows[:, :, -1] = y[start : start + _CHUNK]
-        normal = fold(normal, rows.reshape(-1, unknowns + 1))
-    solution = solve(normal)
-    B = solution[: n * m].reshape(n, m)
-    D = solution[n * m + n + l :].reshape(l, m) if feedthrough else np.zeros((l, m))
-    return B, D

@@ -14,5 +14,7 @@ def fold(R: Array, rows: Array) -> Array:
 
 def solve(R: Array) -> Array:
     """Least-squares solution where the last column of the folded rows is the right-hand side."""
-    solution: Array = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=1e-12)[0]
+    scale = np.linalg.norm(R[:, :-1], axis=0)
+    scale[scale == 0.0] = 1.0  # units of the columns must not matter to what counts as dependent
+    solution: Array = np.linalg.lstsq(R[:, :-1] / scale, R[:, -1], rcond=1e-12)[0] / scale
     return solution
