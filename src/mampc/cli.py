@@ -1,4 +1,4 @@
-"""The command line: `mampc run`, `mampc new`, `mampc identify`."""
+"""The command line: `mampc run`, `reproduce`, `new`, `identify`."""
 
 from __future__ import annotations
 
@@ -50,10 +50,13 @@ def _version(
 
 @app.command()
 def run(
-    study: Annotated[str, typer.Argument(help="A built-in study (quadruple-tank) or a TOML file.")],
+    study: Annotated[str, typer.Argument(help="A built-in study (quadruple-tank, sofc) or a TOML file.")],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME.")
     ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
+    ] = False,
 ) -> None:
     """Run a study: identify a model, close the loop with every controller, compare.
 
@@ -63,13 +66,15 @@ def run(
 
         mampc run quadruple-tank
 
+        mampc run sofc --out results/stack
+
         mampc run my-study.toml --out results/valves
     """
     from mampc.report.output import write_study
     from mampc.report.tables import comparison_tables
     from mampc.study import load_study, run_study
 
-    plan = load_study(study)
+    plan = load_study(study, trust=True if trust else None)
     directory = Path("results") / Path(study).stem if out is None else out
     with _progress() as show:
         result = run_study(plan, show)
@@ -83,6 +88,36 @@ def run(
     if missing is not None:
         _complain(f"note: no figures written; {missing}")
     console.print(f"Results are in {directory}", soft_wrap=True)
+
+
+@app.command()
+def reproduce(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and all results.")] = Path(
+        "results/reproduction"
+    ),
+) -> None:
+    """Run both case studies of the paper and put its results beside ours on one page.
+
+    Writes report.md and a self-contained report.html: the paper's tables and figures redrawn, how the
+    ratios to MPC move with the settings that the paper leaves open, and where its claim holds.
+
+    Example:
+
+        mampc reproduce --out results/paper
+    """
+    from mampc.report.reproduction import reproduce as run_all
+    from mampc.report.tables import comparison_tables
+
+    with _progress() as show:
+        cases = run_all(out, show)
+    console = _console()
+    for case in cases:
+        for table in comparison_tables(case.study, case.summary):
+            console.print(table)
+            console.print()
+        for warning in case.result.warnings:
+            _complain(f"warning: {warning}")
+    console.print(f"Open {out / 'report.html'}", soft_wrap=True)
 
 
 @app.command()

@@ -115,7 +115,9 @@ class KalmanFilter:
         return Estimate(x, last.output_disturbance, last.input_disturbance)
 
     def correct(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Estimate:
-        """Correct with measurements y (l,), taken just before the inputs u (m,) are replaced."""
+        """Correct with measurements y (l,), taken just before the inputs u (m,) are replaced and while the
+        measured disturbances are v (d,).
+        """
         correction = self.gain @ (y - self._output(predicted, self._change(predicted, u, v)))
         n = self.model.n_states
         x = predicted.x + correction[:n]

@@ -102,7 +102,7 @@ class Regulator:
         estimate = self.estimator.predict(state.estimate, u_previous, v_last)
         usable = is_usable(y)
         if usable:
-            estimate = self.estimator.correct(estimate, u_previous, y, v_last)
+            estimate = self.estimator.correct(estimate, u_previous, y, v)  # y shows v at once, u later
         decision = self.controller.step(
             memory,
             estimate.x if usable else np.full_like(estimate.x, np.nan),  # without a measurement: hold

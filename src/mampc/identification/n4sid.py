@@ -83,7 +83,11 @@ def n4sid(
         raise MampcError(f"unstable: expected 'stabilise' or 'refuse', received {unstable!r}")
     m, l = data.u.shape[1], data.y.shape[1]
     s = _block_rows(len(data), m, l, order, block_rows)
-    signals = zip((*data.names.inputs, *data.names.outputs), (*data.u.T, *data.y.T), strict=True)
+    signals = zip(
+        (*data.names.inputs, *data.names.disturbances, *data.names.outputs),
+        (*data.u.T, *data.y.T),
+        strict=True,
+    )
     still = [name for name, signal in signals if np.ptp(signal) == 0]
     if still:
         raise MampcError(f"n4sid: expected signals that vary, received constant {', '.join(still)}")

@@ -52,7 +52,8 @@ def advance(plant: Plant, x: Array, u: Array, dt: float) -> Array:
         return change
 
     # Tight enough that the simulation error stays far below any measurement noise.
-    result = solve_ivp(rate, (0.0, dt), x, method="LSODA", rtol=1e-8, atol=1e-9)
+    atol = 1e-8 * np.maximum(np.abs(x), 1.0)
+    result = solve_ivp(rate, (0.0, dt), x, method="LSODA", rtol=1e-7, atol=atol)
     if not result.success or not np.isfinite(result.y[:, -1]).all():
         raise MampcError(f"{type(plant).__name__}: the integration failed at inputs {u}: {result.message}")
     end: Array = result.y[:, -1]

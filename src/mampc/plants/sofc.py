@@ -102,16 +102,23 @@ class SolidOxideFuelCell:
 
     def derivative(self, x: Array, u: Array) -> Array:
         """Rates of the partial pressures in Pa/s: inflow minus outflow plus reaction; always finite."""
-        x = np.maximum(np.asarray(x, dtype=float), 0.0)
-        inflow, current = self._inflow(u)
-        reaction = self._reaction(current)
+        x, u = np.maximum(np.asarray(x, dtype=float), 0.0), np.asarray(u, dtype=float)
+        h2, steam, o2, n2 = x[..., 0], x[..., 1], x[..., 2], x[..., 3]
+        fuel, air = self._flows(u)
         # Hydrogen and oxygen that are not there cannot react, and then no steam comes either.
-        reaction = reaction * np.minimum(1.0, np.minimum(x[..., 0], x[..., 2]) / _SCARCE)[..., None]
-        outflow = np.concatenate(
-            np.broadcast_arrays(self._outflow(x[..., :2], 0), self._outflow(x[..., 2:], 1)), axis=-1
+        present = np.minimum(1.0, np.minimum(h2, o2) / _SCARCE)
+        reaction = self._reaction_rate(self._current(u)) * present
+        anode = self._outflow_per_pressure(h2, steam, 0)
+        cathode = self._outflow_per_pressure(o2, n2, 1)
+        RT = self.gas_constant * self.temperature
+        per_anode, per_cathode = RT / self.anode_volume, RT / self.cathode_volume
+        rates = (
+            per_anode * (self.h2_fraction * fuel - anode * h2 - 2 * reaction),
+            per_anode * ((1 - self.h2_fraction) * fuel - anode * steam + 2 * reaction),
+            per_cathode * (self.o2_fraction * air - cathode * o2 - reaction),
+            per_cathode * ((1 - self.o2_fraction) * air - cathode * n2),
         )
-        rate: Array = self._pressure_per_mole() * (inflow - outflow + reaction)
-        return rate
+        return np.stack(np.broadcast_arrays(*rates), axis=-1) if x.ndim > 1 or u.ndim > 1 else np.array(rates)
 
     def output(self, x: Array, u: Array | None = None) -> Array:
         """Stack voltage in V, shape (..., 1); finite where gases run out or the current is too large."""
@@ -144,19 +151,27 @@ class SolidOxideFuelCell:
             raise MampcError(
                 f"steady_state: expected inputs (..., 2) or (..., 3) at or above zero, received {u}"
             )
-        inflow, current = self._inflow(u)
+        current, (fuel, air) = self._current(u), self._flows(u)
         if (current / self.cell_area >= self.limiting_current).any():
             raise MampcError(
                 f"steady_state: expected a current below {self.limiting_current * self.cell_area:g} A "
                 f"(limiting current density), received {current.max():g} A"
             )
-        flow = inflow + self._reaction(current)
+        reaction = self._reaction_rate(current)
+        flow = np.stack(
+            [
+                self.h2_fraction * fuel - 2 * reaction,
+                (1 - self.h2_fraction) * fuel + 2 * reaction,
+                self.o2_fraction * air - reaction,
+                (1 - self.o2_fraction) * air,
+            ],
+            axis=-1,
+        )
         for gas, supply, place in (("H2", "fuel", 0), ("O2", "air", 2)):
             if (flow[..., place] <= 0).any():
-                needed = -self._reaction(current)[..., place].max()
                 raise MampcError(
-                    f"steady_state: expected more {gas} than the {needed:.3g} mol/s that the current uses "
-                    f"(starvation), received {inflow[..., place].min():.3g} mol/s; raise the {supply} flow"
+                    f"steady_state: expected more {gas} than the current uses (starvation), received "
+                    f"{-flow[..., place].min():.3g} mol/s too little; raise the {supply} flow"
                 )
         pressures = []
         for side in (0, 1):
@@ -187,34 +202,27 @@ class SolidOxideFuelCell:
         u = np.asarray(self.u_op if u is None else u, dtype=float)
         return u[..., 2] if u.shape[-1] == 3 else np.full(u.shape[:-1], self.current)
 
-    def _inflow(self, u: Any) -> tuple[Array, Array]:
-        """Molar flows of the four gases (..., 4) in mol/s, and the current (...,) in A."""
-        u = np.asarray(u, dtype=float)
-        fuel = self.fuel_flow * np.maximum(u[..., 0], 0.0) / 100
-        air = self.air_flow * np.maximum(u[..., 1], 0.0) / 100
-        h2, o2 = self.h2_fraction, self.o2_fraction
-        return np.stack([h2 * fuel, (1 - h2) * fuel, o2 * air, (1 - o2) * air], axis=-1), self._current(u)
+    def _flows(self, u: Array) -> tuple[Array, Array]:
+        """Molar flows of fuel and air (...,) in mol/s."""
+        fuel = self.fuel_flow / 100 * np.maximum(u[..., 0], 0.0)
+        return fuel, self.air_flow / 100 * np.maximum(u[..., 1], 0.0)
 
-    def _reaction(self, current: Array) -> Array:
-        """Molar rates of the four gases (..., 4) in mol/s: H2 and half as much O2 become steam."""
-        rate = self.n_cells / (4 * self.faraday) * current
-        return np.stack([-2 * rate, 2 * rate, -rate, np.zeros_like(rate)], axis=-1)
+    def _reaction_rate(self, current: Array) -> Array:
+        """O2 used (...,) in mol/s; twice as much H2 is used and becomes steam."""
+        rate: Array = self.n_cells / (4 * self.faraday) * current
+        return rate
 
-    def _outflow(self, pressures: Array, side: int) -> Array:
-        """Molar flows (..., 2) through the orifice of the anode (0) or cathode (1); none below atmosphere."""
-        over = np.maximum(pressures.sum(axis=-1) - self.atmosphere, 0.0)
-        density = np.maximum((pressures * self._masses(side)).sum(axis=-1), 1e-12)
-        speed = np.sqrt(2 * over / (self.gas_constant * self.temperature * density))
-        flow: Array = self._orifice(side) * pressures * speed[..., None]
+    def _outflow_per_pressure(self, first: Array, second: Array, side: int) -> Array:
+        """Molar outflow of a gas per its partial pressure, mol/(s Pa); none below atmospheric pressure."""
+        over = np.maximum(first + second - self.atmosphere, 0.0)
+        density = first * self.molar_masses[2 * side] + second * self.molar_masses[2 * side + 1]
+        RT = self.gas_constant * self.temperature
+        flow: Array = self._orifice(side) * np.sqrt(2 * over / (RT * np.maximum(density, 1e-12)))
         return flow
 
     def _orifice(self, side: int) -> float:
         area = (self.anode_orifice, self.cathode_orifice)[side]
-        return self.discharge_coefficient / float(np.sqrt(1 - self.diameter_ratio**4)) * area
+        return self.discharge_coefficient / float((1 - self.diameter_ratio**4) ** 0.5) * area
 
     def _masses(self, side: int) -> Array:
         return np.array(self.molar_masses[2 * side : 2 * side + 2])
-
-    def _pressure_per_mole(self) -> Array:
-        volumes = np.array([self.anode_volume] * 2 + [self.cathode_volume] * 2)
-        return self.gas_constant * self.temperature / volumes

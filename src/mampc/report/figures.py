@@ -13,6 +13,7 @@ from mampc.identification import IOData, Validation
 from mampc.simulation import Run
 from mampc.study import StudyResult
 from mampc.study.schema import file_word
+from mampc.sweep import Point
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,6 +101,36 @@ def moves_against_error(runs: dict[str, Run], threshold: float) -> Figure:
         panel.margins(x=0.25, y=0.25)
         panel.set_xlim(left=0)
         panel.set_ylim(bottom=0)
+        figure.tight_layout()
+    return figure
+
+
+def sensitivity_figure(points: list[Point], settings: dict[str, str]) -> Figure:
+    """Ratios to plain MPC as one setting changes at a time, a panel a setting."""
+    plt = pyplot()
+    shown = [setting for setting in settings if any(point.setting == setting for point in points)]
+    columns = 4
+    with plt.rc_context(STYLE):
+        rows = -(-len(shown) // columns)
+        figure: Figure
+        figure, axes = plt.subplots(rows, columns, figsize=(9.0, 2.3 * rows), squeeze=False, sharey=True)
+        for panel in axes.flat[len(shown) :]:
+            panel.set_visible(False)
+        for setting, panel in zip(shown, axes.flat, strict=False):
+            own = [point for point in points if point.setting == setting]
+            values = [point.value for point in own]
+            for ratios, label, colour in (
+                ([point.changes_ratio for point in own], "changes / MPC", COLOURS[1]),
+                ([point.error_ratio for point in own], "error / MPC", COLOURS[2]),
+            ):
+                panel.plot(
+                    values, [np.nan if r is None else r for r in ratios], "o-", color=colour, label=label
+                )
+            panel.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
+            if min(values) > 0 and max(values) / min(values) >= 10:
+                panel.set_xscale("log")
+            panel.set_xlabel(settings[setting])
+        axes[0, 0].legend(loc="best")
         figure.tight_layout()
     return figure
 

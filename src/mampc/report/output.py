@@ -65,24 +65,29 @@ def write_study(
     Returns:
         The content of summary.json, and why there are no figures, if so.
     """
-    summary = summarise(result)
     missing = None
     with published_together(directory) as folder:
-        result.model.save(folder / "model.json")
-        if result.data is not None:
-            result.data.to_csv(folder / "identification.csv")
-        for scenario, runs in result.runs.items():
-            for controller, run in runs.items():
-                run.to_csv(folder / f"{file_word(scenario)}-{file_word(controller)}.csv")
         try:
             for name, figure in study_figures(result):
                 on_stage(f"figure {name}")
                 save_figure(figure, folder / "figures" / name)
         except MampcError as error:
             missing = str(error)
-        text = json.dumps(summary, indent=1, allow_nan=False)
-        (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
+        summary = write_files(result, folder)
     return summary, missing
+
+
+def write_files(result: StudyResult, folder: Path) -> dict[str, Any]:
+    """Write everything but the figures into a folder; returns the content of summary.json."""
+    result.model.save(folder / "model.json")
+    if result.data is not None:
+        result.data.to_csv(folder / "identification.csv")
+    for scenario, runs in result.runs.items():
+        for controller, run in runs.items():
+            run.to_csv(folder / f"{file_word(scenario)}-{file_word(controller)}.csv")
+    summary = summarise(result)
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return summary
 
 
 def save_figure(figure: Any, stem: Path) -> None:

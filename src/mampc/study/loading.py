@@ -31,8 +31,13 @@ def template() -> str:
     return files("mampc.studies").joinpath("quadruple-tank.toml").read_text(encoding="utf-8")
 
 
-def load_study(source: str | Path) -> Study:
+def load_study(source: str | Path, *, trust: bool | None = None) -> Study:
     """Read a built-in study by name, or a TOML file.
+
+    Args:
+        source: name or path.
+        trust: whether a plant named `module:Class` may be imported; default if the file lies within the
+            current folder.
 
     Raises:
         StudyError: no such study, or a file with wrong keys, types, values or units; names each.
@@ -56,6 +61,7 @@ def load_study(source: str | Path) -> Study:
         raise StudyError(f"{path}: expected a readable TOML file, received: {error}") from None
     study = parse_study(text, str(path))
     study._folder = path.resolve().parent
+    study._trusted = study._folder.is_relative_to(Path.cwd().resolve()) if trust is None else trust
     return study
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from mampc.arrays import Array, as_vector
+from mampc.condensing import CondensedQP
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.controllers.mampc import METHODS
@@ -21,11 +23,10 @@ from mampc.problem import Limits, TrackingProblem
 from mampc.regulator import Regulator
 from mampc.signals import prbs, steps
 from mampc.simulation import Run, simulate
+from mampc.study.plugins import make_plant
 from mampc.study.schema import (
-    PLANTS,
     ControllerTable,
     IdentificationTable,
-    PlantTable,
     ScenarioTable,
     Study,
     Values,
@@ -52,6 +53,18 @@ class StudyResult:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What all runs of a study share: plant, its usual inputs and disturbances, model and its record."""
+
+    plant: Plant | StateSpace
+    u_op: Array
+    v_op: Array
+    model: StateSpace
+    data: IOData | None
+    identified: Identified | None
+
+
 def run_study(study: Study, on_stage: Callable[[str], None] = lambda stage: None) -> StudyResult:
     """Excite, identify and run every controller in every scenario.
 
@@ -62,48 +75,63 @@ def run_study(study: Study, on_stage: Callable[[str], None] = lambda stage: None
     Raises:
         MampcError: values of the study that do not fit its plant or model.
     """
-    data = identified = None
+    prepared = prepare(study, on_stage)
+    runs: dict[str, dict[str, Run]] = {}
+    for scenario in study.scenarios:
+        runs[scenario.name] = {}
+        for table in study.controllers:
+            on_stage(f"{scenario.name}: {table.name}")
+            runs[scenario.name][table.name] = run_controller(study, prepared, scenario, table)
+    return StudyResult(
+        study, prepared.model, prepared.data, prepared.identified, runs, _warnings(study, prepared.model)
+    )
+
+
+def prepare(study: Study, on_stage: Callable[[str], None] = lambda stage: None) -> Prepared:
+    """The plant of a study, and a model of it: read from a file, or identified from an excitation.
+
+    Raises:
+        MampcError: values of the study that do not fit its plant or model.
+    """
     if study.model is not None:
         model = StateSpace.load(_inside(study._folder, study.model.file))
         if not np.isclose(model.dt, study.dt, rtol=1e-6):
             raise StudyError(f"dt: expected the model's {model.dt:g} s, received {study.dt:g} s")
-        plant: Plant | StateSpace = model if study.plant.kind == "model" else _plant(study.plant)
-    else:
-        plant = _plant(study.plant)
-        assert study.identification is not None
-        on_stage("exciting the plant")
-        data = _record(plant, study.identification, study.dt)
-        on_stage("identifying a model")
-        settings = study.identification
-        identified = n4sid(
-            data, order=settings.order, weighting=settings.weighting, feedthrough=settings.feedthrough
-        )
-        model = identified.model
-    problem = _problem(study, model)
-    controllers = {table.name: _controller(problem, table) for table in study.controllers}
-    warnings = _warnings(next(iter(controllers.values())))
-    reference = _reference(study, plant)
-    runs: dict[str, dict[str, Run]] = {}
-    for scenario in study.scenarios:
-        runs[scenario.name] = {}
-        for name, controller in controllers.items():
-            on_stage(f"{scenario.name}: {name}")
-            runs[scenario.name][name] = simulate(
-                plant,
-                Regulator(controller),
-                reference,
-                noise=scenario.noise,
-                seed=scenario.seed,
-                preview=study.reference.preview,
-                input_disturbance=_from_sample(
-                    scenario.input_disturbance, scenario, study.steps, model.n_inputs
-                ),
-                output_disturbance=_from_sample(
-                    scenario.output_disturbance, scenario, study.steps, model.n_outputs
-                ),
-                progress=False,
-            )
-    return StudyResult(study, model, data, identified, runs, warnings)
+        plant = model if study.plant.kind == "model" else make_plant(study)
+        return Prepared(plant, *_operating_point(study, plant), model, None, None)
+    settings = study.identification
+    assert settings is not None
+    tested = make_plant(study)
+    u_op, v_op = _operating_point(study, tested)
+    on_stage("exciting the plant")
+    data = _record(tested, u_op, v_op, settings, study.dt)
+    on_stage("identifying a model")
+    identified = n4sid(
+        data, order=settings.order, weighting=settings.weighting, feedthrough=settings.feedthrough
+    )
+    return Prepared(tested, u_op, v_op, identified.model, data, identified)
+
+
+def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, table: ControllerTable) -> Run:
+    """One controller in one scenario of a study."""
+    model, plant, at, T = prepared.model, prepared.plant, scenario.disturbance_at, study.steps
+
+    def disturbance(value: Values | None, usual: Any) -> Any:
+        return None if value is None else steps(T, usual, [(at, value)])
+
+    return simulate(
+        plant,
+        Regulator(_controller(_problem(study, model), table)),
+        _reference(study, prepared),
+        noise=scenario.noise,
+        seed=scenario.seed,
+        preview=study.reference.preview,
+        input_disturbance=disturbance(scenario.input_disturbance, np.zeros(model.n_inputs)),
+        output_disturbance=disturbance(scenario.output_disturbance, np.zeros(model.n_outputs)),
+        measured_disturbance=disturbance(scenario.measured_disturbance, prepared.v_op),
+        u_initial=prepared.u_op,
+        progress=False,
+    )
 
 
 def _problem(study: Study, model: StateSpace) -> TrackingProblem:
@@ -116,29 +144,34 @@ def _problem(study: Study, model: StateSpace) -> TrackingProblem:
         raise StudyError(f"[problem] {error}") from None
 
 
-def _plant(table: PlantTable) -> Plant:
-    kind = PLANTS[table.kind]
-    try:
-        plant: Plant = kind(**table.parameters)
-    except TypeError as error:
+def _operating_point(study: Study, plant: Plant | StateSpace) -> tuple[Array, Array]:
+    """Usual inputs (m,) and measured disturbances (d,) of the plant."""
+    m, d = len(plant.names.inputs), len(plant.names.disturbances)
+    given = study.plant.operating_inputs
+    u_op = getattr(plant, "u_op", None) if given is None else given
+    if u_op is None:
         raise StudyError(
-            f"plant.parameters: expected parameters of {kind.__name__}, received: {error}"
-        ) from None
-    except MampcError as error:
-        raise StudyError(f"plant.parameters: {error}") from None
-    return plant
+            f"plant.operating_inputs: expected {m} values, since {study.plant.kind!r} has no u_op, "
+            "received none"
+        )
+    return as_vector("plant.operating_inputs", u_op, m), as_vector("v_op", getattr(plant, "v_op", 0.0), d)
 
 
-def _record(plant: Plant, table: IdentificationTable, dt: float) -> IOData:
+def _record(plant: Plant, u_op: Array, v_op: Array, table: IdentificationTable, dt: float) -> IOData:
+    """Excite the inputs, and the measured disturbances if an amplitude is given for them too."""
+    mean = u_op
+    if isinstance(table.amplitude, list) and len(table.amplitude) == len(u_op) + len(v_op):
+        mean = np.concatenate([u_op, v_op])
     signal = prbs(
         order=table.prbs_order,
         amplitude=table.amplitude,
         hold=table.hold,
-        mean=getattr(plant, "u_op", 0.0),
-        inputs=len(plant.names.inputs),
+        mean=mean,
+        inputs=len(mean),
         seed=table.seed,
     )
-    return excite(plant, signal, dt=dt, noise=table.noise, seed=table.seed)
+    rest = plant.steady_state(np.concatenate([u_op, v_op]))
+    return excite(plant, signal, dt=dt, noise=table.noise, seed=table.seed, x0=rest)
 
 
 def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
@@ -152,8 +185,8 @@ def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
     return MAMPC(problem, MoveRules(**table.rules.model_dump()), method=method)
 
 
-def _reference(study: Study, plant: Plant | StateSpace) -> Any:
-    table = study.reference
+def _reference(study: Study, prepared: Prepared) -> Array:
+    table, plant = study.reference, prepared.plant
     staircase = steps(study.steps, table.initial, [(change.at, change.value) for change in table.changes])
     if staircase.shape[1] != len(plant.names.outputs):
         raise StudyError(
@@ -161,25 +194,25 @@ def _reference(study: Study, plant: Plant | StateSpace) -> Any:
         )
     if not table.relative:
         return staircase
-    u_op = np.asarray(getattr(plant, "u_op", None))
-    y_op = plant.y_op if isinstance(plant, StateSpace) else plant.output(plant.steady_state(u_op), u_op)
-    return y_op + staircase
+    usual = np.concatenate([prepared.u_op, prepared.v_op])
+    if isinstance(plant, StateSpace):
+        return (
+            staircase
+            + plant.y_op
+            + plant.C @ plant.steady_state(usual)
+            + plant.D @ (usual - plant.all_inputs_op)
+        )
+    return staircase + np.asarray(plant.output(plant.steady_state(usual), usual))
 
 
-def _from_sample(value: Values | None, scenario: ScenarioTable, samples: int, width: int) -> Any:
-    if value is None:
-        return None
-    return steps(samples, np.zeros(width), [(scenario.disturbance_at, value)])
-
-
-def _warnings(controller: Controller) -> tuple[str, ...]:
-    radius = float(np.abs(controller.condensed.closed_loop_poles()).max())
-    if radius < 1.0:
+def _warnings(study: Study, model: StateSpace) -> tuple[str, ...]:
+    problem = _problem(study, model)
+    radius = float(np.abs(CondensedQP(problem).closed_loop_poles()).max())
+    if radius < 1.0 + 1e-6:  # inputs that can stand in for one another leave a pole at 1, which is harmless
         return ()
-    problem = controller.problem
     return (
         f"the closed loop without limits is unstable: spectral radius {radius:.3f} "
-        f"at dt = {problem.model.dt:g} s with horizons "
+        f"at dt = {study.dt:g} s with horizons "
         f"{problem.prediction_horizon} and {problem.control_horizon}; "
         "lengthen the prediction horizon or the sample time, or raise move_weight",
     )

@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
 
 from mampc.controllers.mampc import METHODS
-from mampc.plants import QuadrupleTank
+from mampc.plants import QuadrupleTank, SolidOxideFuelCell
 from mampc.problem import LONGEST_HORIZON
 
-PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank}
+PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank, "sofc": SolidOxideFuelCell}
+PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 LONGEST_RUN = 1_000_000  # samples
 
 _SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
@@ -46,6 +47,7 @@ class Table(BaseModel):
 class PlantTable(Table):
     kind: Word
     parameters: dict[str, Any] = {}
+    operating_inputs: list[Number] | None = None
 
 
 class ModelTable(Table):
@@ -99,6 +101,7 @@ class ScenarioTable(Table):
     seed: Annotated[int, Field(ge=0)] = 0
     input_disturbance: Values | None = None
     output_disturbance: Values | None = None
+    measured_disturbance: Values | None = None
     disturbance_at: Annotated[int, Field(ge=0)] = 0
 
 
@@ -148,14 +151,15 @@ class Study(Table):
     controllers: Annotated[list[ControllerTable], Field(min_length=1)]
 
     _folder: Path = PrivateAttr(default=Path())
+    _trusted: bool = PrivateAttr(default=True)
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:
         if (self.identification is None) == (self.model is None):
             raise ValueError("one of the tables [identification] and [model]")
-        if self.plant.kind not in ("model", *PLANTS):
+        if self.plant.kind not in ("model", *PLANTS) and not PLUGIN.fullmatch(self.plant.kind):
             known = ", ".join(sorted(("model", *PLANTS)))
-            raise ValueError(f"a plant.kind among {known}; received {self.plant.kind!r}")
+            raise ValueError(f"a plant.kind among {known}, or module:Class; received {self.plant.kind!r}")
         if self.plant.kind == "model" and self.model is None:
             raise ValueError("a table [model] with a file for plant.kind = 'model'")
         if self.plant.kind == "model" and self.plant.parameters:

@@ -1,0 +1,62 @@
+"""Plants of a study: built-in by name, or a class of the user's as `module:Class`.
+
+A study file is data. The one way it can run code is a plant named `module:Class`, and that is done only
+for studies the user trusts: those within the current folder, or with `--trust` on the command line.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Any
+
+from mampc.errors import MampcError, StudyError
+from mampc.names import Names
+from mampc.plants import Plant
+from mampc.study.schema import PLANTS, Study
+
+MEMBERS = ("names", "derivative", "output", "steady_state")
+
+
+def make_plant(study: Study) -> Plant:
+    """The plant that a study names, with its parameters.
+
+    Raises:
+        StudyError: an unknown module or class, code of a study not trusted, missing members or parameters
+            that the class does not take.
+    """
+    kind = study.plant.kind
+    maker = PLANTS[kind] if kind in PLANTS else _imported(study)
+    try:
+        plant: Plant = maker(**study.plant.parameters)
+    except TypeError as error:
+        raise StudyError(f"plant.parameters: expected parameters of {kind}, received: {error}") from None
+    except MampcError as error:
+        raise StudyError(f"plant.parameters: {error}") from None
+    missing = [member for member in MEMBERS if not hasattr(plant, member)]
+    if missing or not isinstance(plant.names, Names):
+        raise StudyError(
+            f"plant.kind: expected a class with members {', '.join(MEMBERS)} (names a mampc.Names), "
+            f"received {kind} without {', '.join(missing) or 'such names'}"
+        )
+    return plant
+
+
+def _imported(study: Study) -> Any:
+    """The class behind module:Class; its module may lie beside the study."""
+    module_name, class_name = study.plant.kind.split(":")
+    if not study._trusted:
+        raise StudyError(
+            f"plant.kind: {study.plant.kind!r} runs code, and this study is not within the current folder; "
+            "look at that code, then allow it with --trust"
+        )
+    folder = str(study._folder)
+    sys.path.insert(0, folder)
+    try:
+        return getattr(importlib.import_module(module_name), class_name)
+    except ImportError as error:
+        raise StudyError(f"plant.kind: expected a module that can be imported, received: {error}") from None
+    except AttributeError:
+        raise StudyError(f"plant.kind: expected a class in {module_name}, received {class_name!r}") from None
+    finally:
+        sys.path.remove(folder)
