@@ -127,7 +127,7 @@ def sensitivity_figure(points: list[Point], settings: dict[str, str]) -> Figure:
                     values, [np.nan if r is None else r for r in ratios], "o-", color=colour, label=label
                 )
             panel.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
-            if min(values) > 0 and max(values) / min(values) >= 10:
+            if min(values) > 0 and max(values) / min(values) >= 50:
                 panel.set_xscale("log")
             panel.set_xlabel(settings[setting])
         axes[0, 0].legend(loc="best")

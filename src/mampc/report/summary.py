@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ def _controller(run: Run, threshold: float, skip: int) -> dict[str, Any]:
             "max": float(microseconds.max()),
         },
         "status": run.statuses,
+        "plant_faults": dict(Counter(fault for faults in run.faults.values() for fault in faults)),
     }
 
 

@@ -82,9 +82,8 @@ def run_study(study: Study, on_stage: Callable[[str], None] = lambda stage: None
         for table in study.controllers:
             on_stage(f"{scenario.name}: {table.name}")
             runs[scenario.name][table.name] = run_controller(study, prepared, scenario, table)
-    return StudyResult(
-        study, prepared.model, prepared.data, prepared.identified, runs, _warnings(study, prepared.model)
-    )
+    warnings = _warnings(study, prepared.model) + _faults(runs)
+    return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings)
 
 
 def prepare(study: Study, on_stage: Callable[[str], None] = lambda stage: None) -> Prepared:
@@ -215,6 +214,17 @@ def _warnings(study: Study, model: StateSpace) -> tuple[str, ...]:
         f"at dt = {study.dt:g} s with horizons "
         f"{problem.prediction_horizon} and {problem.control_horizon}; "
         "lengthen the prediction horizon or the sample time, or raise move_weight",
+    )
+
+
+def _faults(runs: dict[str, dict[str, Run]]) -> tuple[str, ...]:
+    """What took the plant out of its range, run by run."""
+    return tuple(
+        f"{scenario}, {name}: the plant left its range at {len(run.faults)} samples "
+        f"({', '.join(sorted({fault for faults in run.faults.values() for fault in faults}))})"
+        for scenario, controllers in runs.items()
+        for name, run in controllers.items()
+        if run.faults
     )
 
 
