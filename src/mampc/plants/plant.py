@@ -19,7 +19,8 @@ class Plant(Protocol):
     `x` has shape (..., n) and `u` (..., m): the last axis holds the signals. Its dimensions are those of
     `names`. A plant may have `u_op`, the inputs (m,) of its usual operating point; with measured
     disturbances among its names, its methods take (..., m + d) inputs too and it has `v_op`, shape (d,).
-    A method `faults(x, u)` may name what takes it out of its range.
+    `x_min` may bound the states from below, and a method `faults(x, u)` may name what takes it out of its
+    range.
     """
 
     @property
@@ -56,5 +57,6 @@ def advance(plant: Plant, x: Array, u: Array, dt: float) -> Array:
     result = solve_ivp(rate, (0.0, dt), x, method="LSODA", rtol=1e-7, atol=atol)
     if not result.success or not np.isfinite(result.y[:, -1]).all():
         raise MampcError(f"{type(plant).__name__}: the integration failed at inputs {u}: {result.message}")
-    end: Array = result.y[:, -1]
+    # Rounding must not make a level or a pressure negative.
+    end: Array = np.maximum(result.y[:, -1], getattr(plant, "x_min", -np.inf))
     return end

@@ -39,6 +39,7 @@ class QuadrupleTank:
     k_pump: tuple[float, ...] = parameter((7.45, 7.30), "cm3/s per %", _FITTED)
     u_op: tuple[float, ...] = parameter((50.0, 50.0), "%", _PAPER)
 
+    x_min: ClassVar[float] = 0.0
     names: ClassVar[Names] = Names(("u1", "u2"), ("y1", "y2"), ("h1", "h2", "h3", "h4"))
 
     def __post_init__(self) -> None:

@@ -74,6 +74,7 @@ class SolidOxideFuelCell:
         """The usual current in A."""
         return (self.current,)
 
+    x_min: ClassVar[float] = 0.0
     names: ClassVar[Names] = Names(
         ("fuel", "air"), ("voltage",), ("p_H2", "p_H2O", "p_O2", "p_N2"), disturbances=("current",)
     )
