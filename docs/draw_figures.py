@@ -6,7 +6,7 @@ from mampc.report.figures import study_figures
 from mampc.study import load_study, run_study
 
 IMAGES = Path(__file__).parent / "images"
-SHOWN = {"noisy-u1", "noisy-y1", "noisy-moves-against-error"}
+SHOWN = {"noisy_u1", "noisy_y1", "noisy_moves-against-error"}
 
 
 def main() -> None:

@@ -69,6 +69,16 @@ def predicted(model, x, plan, samples, input_disturbance=0.0, output_disturbance
     return np.array(outputs)
 
 
+def violation_scale(problem):
+    """Per output the square root of its weight, or of that of the moves through the largest step response."""
+    model, n_p = problem.model, problem.prediction_horizon
+    rest = np.tile(model.u_op, (n_p + 1, 1))
+    steps = [model.response(rest + unit) - model.y_op for unit in np.eye(model.n_inputs)]
+    reach = np.abs(steps).max(axis=(0, 1))
+    moving = np.abs(problem.move_weight).max() / np.maximum(reach, 1e-6) ** 2
+    return np.sqrt(np.maximum(np.abs(np.diag(problem.output_weight)), moving))
+
+
 def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, output_disturbance=0.0):
     """The cost of planned inputs as `TrackingProblem` states it, by simulating the model."""
     n_p, limits = problem.prediction_horizon, problem.limits
@@ -77,10 +87,11 @@ def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, outp
     changes = np.diff(np.vstack([u_previous, plan]), axis=0)
     weighed = changes if problem.weigh_first_move else changes[1:]
     excess = np.maximum(0.0, np.maximum(y - limits.y_max, limits.y_min - y))[1:].max(axis=0)
+    scaled = violation_scale(problem) * excess
     return (
         np.einsum("ia,ab,ib", error, problem.output_weight, error)
         + np.einsum("ja,ab,jb", weighed, problem.move_weight, weighed)
-        + problem.output_limit_weight * np.sum(excess + excess**2 / 2)
+        + problem.output_limit_weight * np.sum(scaled + scaled**2 / 2)
     )
 
 

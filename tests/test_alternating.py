@@ -305,8 +305,44 @@ def test_move_limits_that_contradict_the_input_range_still_give_inputs_within_th
     problem = tank_problem(limits=mampc.Limits(u_min=0.0, u_max=100.0, du_max=1.0))
     controller = ours(problem, mampc.MoveRules(max_moves=3), polish=polish)
     decision = decide(controller, [120.0, 50.0], np.zeros(4), problem.model.y_op)
-    assert decision.held
-    np.testing.assert_array_equal(decision.u, [100.0, 50.0])
+    assert not decision.held
+    assert (decision.plan >= 0.0).all()
+    assert (decision.plan <= 100.0).all()
+
+
+def test_inputs_outside_their_range_come_back_and_count_as_moves():
+    controller = ours(tank_problem(), mampc.MoveRules(max_moves=1, sparsity_horizon=2), polish=True)
+    state = controller.initial_state([120.0, 120.0])
+    decision = controller.step(state, np.zeros(4), controller.problem.model.y_op)
+    np.testing.assert_array_equal(decision.u, [100.0, 100.0])
+    np.testing.assert_array_equal(decision.changes[0], [-20.0, -20.0])
+    assert not decision.moves[1:].any()
+
+
+def test_without_any_limit_the_polished_plan_is_the_best_on_its_pattern():
+    """No limits at all leave programs without a single bound."""
+    problem = tank_problem(limits=mampc.Limits())
+    controller = ours(problem, mampc.MoveRules(max_moves=2, sparsity_horizon=2), polish=True)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        decision = decide(controller, [50.0, 50.0], rng.standard_normal(4), problem.model.y_op)
+        assert decision.status in (Status.FEASIBLE, Status.ITERATION_LIMIT)
+        assert np.count_nonzero(decision.changes) <= 2
+        free = decision.moves.ravel()
+        gradient = controller.condensed.H @ decision.changes.ravel()
+        assert np.isfinite(gradient[free]).all()
+
+
+def test_rounding_of_what_was_applied_is_no_move():
+    rules = mampc.MoveRules(max_moves=1, sparsity_horizon=3)
+    wobbly = np.array([[50.0, 50.0], [50.0 + 1e-12, 50.0], [50.0, 50.0 - 1e-12]])
+    assert rules.moves_left(wobbly, 10) == 1
+
+
+def test_an_immense_penalty_growth_still_ends():
+    controller = ours(tank_problem(), mampc.MoveRules(max_moves=3), penalty_growth=1e100)
+    decision = decide(controller, [50.0, 50.0], np.ones(4), controller.problem.model.y_op)
+    assert np.isfinite(decision.plan).all()
 
 
 def test_output_limits_are_softened_in_every_round():

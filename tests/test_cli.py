@@ -109,3 +109,21 @@ def test_the_readme_example_runs(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "tracking_error" in done.stdout
+
+
+def test_identify_replaces_models_and_nothing_else(record, tmp_path):
+    data = tmp_path / "data.json"
+    data.write_bytes(record.read_bytes())
+    done = call("identify", data, "--inputs", "valve", "--outputs", "level", "--dt", "10", cwd=tmp_path)
+    assert done.returncode == 2
+    assert data.read_bytes() == record.read_bytes()
+
+
+def test_a_model_that_explains_little_is_warned_of(tmp_path):
+    rng = np.random.default_rng(0)
+    mampc.IOData(rng.standard_normal((300, 1)), rng.standard_normal((300, 1)), 1.0).to_csv(
+        tmp_path / "noise.csv"
+    )
+    done = call("identify", "noise.csv", "--inputs", "u1", "--outputs", "y1", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "warning: the model explains less" in done.stderr

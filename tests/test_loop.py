@@ -365,3 +365,58 @@ def test_on_the_identified_tank_the_alternating_method_moves_far_less_and_tracks
     assert ((mpc.sparse_density > 0.3) & (mpc.sparse_density < 0.8)).all()
     assert (sparse.sparse_density < 0.75 * mpc.sparse_density).all()
     assert 1.05 < sparse.tracking_error / mpc.tracking_error < 1.30
+
+
+def test_a_decision_cannot_be_changed_behind_the_loops_back():
+    loop = mampc.Regulator(mampc.MPC(tank_problem()))
+    decision = loop.step(loop.initial_state(), tank_problem().model.y_op, tank_problem().model.y_op)
+    for array in (decision.u, decision.plan, decision.changes):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 99.0
+
+
+def test_an_estimate_that_ran_away_starts_again():
+    """An unstable model predicts itself out of all numbers while measurements are missing."""
+    model = mampc.StateSpace([[1.2]], [[1.0]], [[1.0]], None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=5, control_horizon=2, limits=mampc.Limits(u_min=-1.0, u_max=1.0)
+    )
+    loop = mampc.Regulator(mampc.MPC(problem))
+    state = loop.initial_state()
+    for _ in range(5000):
+        state = loop.step(state, [np.nan], [0.1]).state
+    decision = loop.step(state, [0.0], [0.1])
+    assert not decision.held
+
+
+def test_the_preview_reaches_beyond_the_last_sample_of_the_run():
+    problem = tank_problem()
+    reference = problem.model.y_op + mampc.steps(40, [0.0, 0.0], [(22, (3.0, 3.0))])
+    runs = [
+        mampc.simulate(problem.model, mampc.Regulator(mampc.MPC(problem)), reference, steps=T, preview=True)
+        for T in (20, 40)
+    ]
+    np.testing.assert_allclose(runs[0].u, runs[1].u[:20], atol=1e-9)
+    assert np.abs(runs[0].u[-1] - runs[0].u[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("integrating", [False, True])
+def test_with_disturbances_at_the_inputs_the_first_step_has_no_jump_either(integrating):
+    poles = [1.0, 0.7] if integrating else [0.9, 0.7]
+    model = mampc.StateSpace(np.diag(poles), np.eye(2), [[1.0, 0.3], [0.2, 1.0]], None, 1.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=10, control_horizon=3)
+    loop = mampc.Regulator(mampc.MPC(problem), mampc.KalmanFilter.offset_free(model, disturbance="input"))
+    y = np.array([3.0, -2.0])
+    decision = loop.step(loop.initial_state([0.5, -0.5], y), y, y)
+    np.testing.assert_allclose(decision.changes, 0.0, atol=1e-6)
+
+
+def test_more_inputs_than_outputs_leave_no_offset_with_disturbances_at_the_inputs():
+    model = mampc.StateSpace(
+        np.diag([1.0, 0.8, 0.6]), [[1.0, 0.5, 0.2], [0.1, 1.0, 0.3], [0.4, 0.2, 1.0]],
+        [[1.0, 0.2, 0.1], [0.1, 1.0, 0.5]], None, 1.0,
+    )  # fmt: skip
+    problem = mampc.TrackingProblem(model, prediction_horizon=15, control_horizon=4)
+    loop = mampc.Regulator(mampc.MPC(problem), mampc.KalmanFilter.offset_free(model, disturbance="input"))
+    run = mampc.simulate(model, loop, [1.0, -1.0], steps=300, input_disturbance=[0.3, -0.2, 0.1])
+    np.testing.assert_allclose(run.y[-1], [1.0, -1.0], atol=1e-3)

@@ -1,13 +1,16 @@
 """Study files: what is accepted, what is refused and how, and what comes of a run."""
 
+import io
 import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import mampc
-from mampc.report.output import published_together, write_study
+from mampc.report.output import published_together, require_writable, write_study
 from mampc.report.summary import summarise
+from mampc.report.tables import comparison_tables
 from mampc.study import builtin_studies, load_study, parse_study, run_study, template
 
 SHORT = template().replace("steps = 145", "steps = 20").replace("prbs_order = 8", "prbs_order = 6")
@@ -122,7 +125,8 @@ def test_the_summary_holds_what_is_promised(result):
     assert {"study", "steps", "dt", "scenarios"} <= set(summary)
     assert [scenario["name"] for scenario in summary["scenarios"]] == ["noise-free", "noisy"]
     for scenario in summary["scenarios"]:
-        assert [entry["name"] for entry in scenario["controllers"]] == ["MPC", "MAMPC ns=1", "MAMPC ns=3"]
+        names = [entry["name"] for entry in scenario["controllers"]]
+        assert names == ["MPC", "MAMPC ns=1", "MAMPC ns=3", "MAMPC ns=3 polished"]
         for entry in scenario["controllers"]:
             for part in (entry, entry["without_transient"]):
                 assert part["sparse_density"]["threshold"] == 0.1
@@ -142,9 +146,9 @@ def test_the_files_of_a_run_can_be_read_back(result, tmp_path):
     assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
     model = mampc.StateSpace.load(tmp_path / "out" / "model.json")
     np.testing.assert_array_equal(model.A, result.model.A)
-    trajectory = np.genfromtxt(tmp_path / "out" / "noisy-mpc.csv", delimiter=",", names=True)
+    trajectory = np.genfromtxt(tmp_path / "out" / "noisy_mpc.csv", delimiter=",", names=True)
     np.testing.assert_array_equal(trajectory["u1"], result.runs["noisy"]["MPC"].u[:, 0])
-    for name in ("prbs-inputs", "prbs-outputs", "noisy-u1", "noisy-y2", "noisy-moves-against-error"):
+    for name in ("prbs-inputs", "prbs-outputs", "noisy_u1", "noisy_y2", "noisy_moves-against-error"):
         for kind in ("png", "svg"):
             assert (tmp_path / "out" / "figures" / f"{name}.{kind}").stat().st_size > 1000
 
@@ -169,6 +173,45 @@ def test_results_appear_whole_or_not_at_all(tmp_path):
     assert (target / "summary.json").read_text() == "new"
     assert (target / "notes.txt").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_files_of_the_last_run_that_are_not_made_again_go_away(tmp_path):
+    target = tmp_path / "out"
+    for names in (("a.csv", "b.csv", "summary.json"), ("b.csv", "summary.json")):
+        with published_together(target) as folder:
+            for name in names:
+                (folder / name).write_text(name)
+    assert sorted(path.name for path in target.glob("*.*") if path.name[0] != ".") == [
+        "b.csv",
+        "summary.json",
+    ]
+
+
+def test_what_a_killed_run_left_is_cleared_away(tmp_path):
+    target = tmp_path / "out"
+    (tmp_path / ".out.partial-999999999-left").mkdir()
+    require_writable(target)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
+    text = SHORT.replace('name = "MPC"', r"name = 'a [/b] $\foo{$'")
+    outcome = run_study(parse_study(text))
+    summary, missing = write_study(outcome, tmp_path / "out")
+    assert missing is None
+    console = Console(width=200, file=io.StringIO())
+    for table in comparison_tables(outcome.study, summary):
+        console.print(table)
+    assert "a [/b] $" in console.file.getvalue()
+
+
+def test_trajectories_of_names_that_share_words_stay_apart(tmp_path):
+    text = SHORT.replace('name = "noise-free"', 'name = "a"').replace('name = "noisy"', 'name = "a-b"')
+    text = text.replace('name = "MPC"', 'name = "c"').replace('name = "MAMPC ns=1"', 'name = "b-c"')
+    outcome = run_study(parse_study(text))
+    write_study(outcome, tmp_path / "out")
+    runs = sum(len(runs) for runs in outcome.runs.values())
+    assert len(list((tmp_path / "out").glob("a*.csv"))) == runs
 
 
 def test_an_identified_model_file_can_be_studied(result, tmp_path):

@@ -22,7 +22,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_NARROW = 118  # columns of a table that is not on a terminal
+_NARROW = 125  # columns of a table that is not on a terminal
+POOR_FIT = 40.0  # percent; a model below it is hardly one to control with
 
 
 def main() -> None:
@@ -70,12 +71,13 @@ def run(
 
         mampc run my-study.toml --out results/valves
     """
-    from mampc.report.output import write_study
+    from mampc.report.output import require_writable, write_study
     from mampc.report.tables import comparison_tables
     from mampc.study import load_study, run_study
 
     plan = load_study(study, trust=True if trust else None)
     directory = Path("results") / Path(study).stem if out is None else out
+    require_writable(directory)
     with _progress() as show:
         result = run_study(plan, show)
         summary, missing = write_study(result, directory, show)
@@ -87,7 +89,7 @@ def run(
         _complain(f"warning: {warning}")
     if missing is not None:
         _complain(f"note: no figures written; {missing}")
-    console.print(f"Results are in {directory}", soft_wrap=True)
+    console.print(f"Results are in {directory}", soft_wrap=True, markup=False)
 
 
 @app.command()
@@ -105,9 +107,11 @@ def reproduce(
 
         mampc reproduce --out results/paper
     """
+    from mampc.report.output import require_writable
     from mampc.report.reproduction import reproduce as run_all
     from mampc.report.tables import comparison_tables
 
+    require_writable(out)
     with _progress() as show:
         cases = run_all(out, show)
     console = _console()
@@ -148,8 +152,14 @@ def identify(
     dt: Annotated[
         float | None, typer.Option(help="Sample time in seconds; default from a column named time.")
     ] = None,
+    disturbances: Annotated[
+        str, typer.Option(help="Columns of inputs that are measured and not manipulated.")
+    ] = "",
     order: Annotated[int | None, typer.Option(help="Model order; default from the singular values.")] = None,
     weighting: Annotated[str, typer.Option(help="cva, n4sid or moesp.")] = "cva",
+    block_rows: Annotated[
+        int | None, typer.Option(help="Samples of past and future; more than the longest delay.")
+    ] = None,
     feedthrough: Annotated[
         bool, typer.Option(help="Estimate D: inputs that show in the outputs within their own sample.")
     ] = False,
@@ -175,14 +185,22 @@ def identify(
     target = data.with_suffix(".json") if out is None else out
     if not target.parent.is_dir():
         raise MampcError(f"--out: expected a file in a folder that exists, received {target}")
+    if target.exists() and not _is_model(target):
+        raise MampcError(
+            f"--out: expected a new file or a model to replace, received {target}, which is neither"
+        )
     if target.suffix != ".json":
         raise MampcError(f"--out: expected a name that ends in .json, received {target}")
     with _progress() as show:
         show("reading the record")
-        record = IOData.from_csv(data, inputs=_words(inputs), outputs=_words(outputs), dt=dt)
+        record = IOData.from_csv(
+            data, inputs=_words(inputs), outputs=_words(outputs), disturbances=_words(disturbances), dt=dt
+        )
         estimation, rest = record.split(share)
         show("identifying a model")
-        identified = n4sid(estimation, order=order, weighting=weighting, feedthrough=feedthrough)
+        identified = n4sid(
+            estimation, order=order, weighting=weighting, block_rows=block_rows, feedthrough=feedthrough
+        )
         validation = identified.validate(rest)
         show("writing the model and its figure")
         identified.model.save(target)
@@ -199,12 +217,31 @@ def identify(
         _complain(
             "warning: poles outside the unit circle were mirrored to its inside; check the record for drifts"
         )
+    poor = [
+        name for name, fit in zip(record.names.outputs, validation.fit, strict=True) if not fit > POOR_FIT
+    ]
+    if poor:
+        _complain(
+            f"warning: the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at "
+            "the figure, and try another --order, more --block-rows for long delays, or a richer record"
+        )
     if missing is not None:
         _complain(f"note: no figure written; {missing}")
-    console.print(f"Wrote {target}", soft_wrap=True)
+    console.print(f"Wrote {target}", soft_wrap=True, markup=False)
+
+
+def _is_model(path: Path) -> bool:
+    from mampc.lti import StateSpace
+
+    try:
+        StateSpace.load(path)
+    except MampcError:
+        return False
+    return True
 
 
 def _fit_table(outputs: tuple[str, ...], fit: Any, validation: Any) -> Any:
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table()
@@ -212,7 +249,7 @@ def _fit_table(outputs: tuple[str, ...], fit: Any, validation: Any) -> Any:
     for header in ("fit, estimation part (%)", "fit, hold-out part (%)", "whiteness of residuals (p)"):
         table.add_column(header, justify="right")
     for name, on_own, on_rest, p in zip(outputs, fit, validation.fit, validation.whiteness, strict=True):
-        table.add_row(name, f"{on_own:.1f}", f"{on_rest:.1f}", f"{p:.3f}")
+        table.add_row(escape(name), f"{on_own:.1f}", f"{on_rest:.1f}", f"{p:.3f}")
     return table
 
 
@@ -234,9 +271,9 @@ def _complain(message: str) -> None:
 @contextmanager
 def _progress() -> Iterator[Any]:
     """A function that shows the current stage: a spinner on a terminal, a line each elsewhere."""
-    console = Console(stderr=True, highlight=False)
+    console = Console(stderr=True, highlight=False, markup=False)
     if not console.is_terminal:
-        yield lambda stage: None
+        yield lambda stage: None if stage.startswith("figure") else _complain(f"{stage} ...")
         return
     with console.status("") as status:
         yield lambda stage: status.update(f"{stage} ...")

@@ -14,7 +14,8 @@ block-triangular matrix of step responses and error = r - free
 
 Everything that changes from sample to sample (f, the bounds, the error, and the optimum as long as no
 limit is active) is affine in the parameter p = (x, u_prev, d_u, d_y, v, 1, r): one matrix-vector product.
-Where outputs are limited, one violation per limited output stands before the moves: z = (violations, d).
+Where outputs are limited, one violation per limited output, scaled as in `TrackingProblem`, stands before
+the moves: z = (violations, d).
 """
 
 from __future__ import annotations
@@ -116,6 +117,7 @@ class CondensedQP:
         H: its block for the moves, shape (n_moves, n_moves).
         theta: predicted outputs per move, shape ((np + 1) l, n_moves).
         cumulate: u_j - u_prev per move, shape (n_moves, n_moves).
+        violation_scale: sqrt(q) of `TrackingProblem`, per output, shape (l,).
 
     Raises:
         MampcError: the moves are not all determined by the weights (H is singular), or an unstable
@@ -207,7 +209,12 @@ class CondensedQP:
         predicted = np.arange(l, len(self.theta))
         self._above = predicted[np.isfinite(limits.y_max)[predicted % l]]
         self._below = predicted[np.isfinite(limits.y_min)[predicted % l]]
-        violation = np.eye(v)[np.maximum(np.cumsum(limited) - 1, 0)] if v else np.zeros((l, 0))
+        tracking = np.abs(np.diag(problem.output_weight))
+        reach = np.abs(self.theta.reshape(-1, l, n)).max(axis=(0, 2))
+        moving = np.abs(problem.move_weight).max() / np.maximum(reach, 1e-6) ** 2
+        self.violation_scale = np.sqrt(np.maximum(np.maximum(tracking, moving), 1e-12))
+        violation = np.zeros((l, v))
+        violation[limited] = np.diag(1 / self.violation_scale[limited])
         A = np.block(
             [
                 [np.zeros((len(inputs), v)), self.cumulate[inputs]],
@@ -284,8 +291,8 @@ class CondensedQP:
         residual = instance.error - self.weighted_theta @ moves
         cost = residual @ residual + moves @ self.R @ moves
         if self.n_violations:
-            e = self.violations(instance, moves)
-            cost += self.problem.output_limit_weight * (e.sum() + 0.5 * (e @ e))
+            scaled = self.violation_scale * self.violations(instance, moves)
+            cost += self.problem.output_limit_weight * (scaled.sum() + 0.5 * (scaled @ scaled))
         return float(cost)
 
     def violations(self, instance: Instance, moves: Array) -> Array:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's palette: told apart by the colour-blind and in print.
 COLOURS = ("#7f7f7f", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-STYLE = {
+STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.spines.top": False,
@@ -33,23 +33,20 @@ WIDE = (6.5, 2.6)  # inches: the text width of a one-column paper
 
 def closed_loop_figure(t: Array, u: Array, y: Array, r: Array, names: Names) -> Figure:
     """All inputs (staircases) and outputs (with references) of a closed loop, in stacked panels."""
-    plt = pyplot()
     rows = len(names.outputs) + len(names.inputs)
-    with plt.rc_context(STYLE):
-        figure: Figure
-        figure, axes = plt.subplots(rows, 1, figsize=(6.5, 1.5 * rows), sharex=True, squeeze=False)
+    with styled():
+        figure, axes = new_figure(rows, 1, figsize=(6.5, 1.5 * rows), sharex=True)
         scale, unit = time_scale(t)
         panels = iter(axes[:, 0])
         for i, (name, panel) in enumerate(zip(names.outputs, panels, strict=False)):
             panel.step(t / scale, r[:, i], where="post", color="black", linestyle="--", label="reference")
-            panel.plot(t / scale, y[:, i], color=COLOURS[1], label=name)
-            panel.set_ylabel(name)
+            panel.plot(t / scale, y[:, i], color=COLOURS[1], label=label(name))
+            panel.set_ylabel(label(name))
         for i, (name, panel) in enumerate(zip(names.inputs, axes[len(names.outputs) :, 0], strict=True)):
             panel.step(t / scale, u[:, i], where="post", color=COLOURS[2])
-            panel.set_ylabel(name)
+            panel.set_ylabel(label(name))
         axes[0, 0].legend(loc="best")
         axes[-1, 0].set_xlabel(f"time ({unit})")
-        figure.tight_layout()
     return figure
 
 
@@ -61,14 +58,29 @@ def time_scale(time: Array) -> tuple[float, str]:
     return (60.0, "min") if end > 600 else (1.0, "s")
 
 
-def pyplot() -> Any:
-    """matplotlib without a window, or an error that says how to get it."""
+def new_figure(rows: int = 1, columns: int = 1, **settings: Any) -> tuple[Figure, Any]:
+    """A figure and its axes (rows, columns), outside pyplot: no window, no state, nothing to close.
+
+    Raises:
+        MampcError: matplotlib is missing.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MampcError("figures need matplotlib: pip install 'mampc[plot]'") from None
+    figure = Figure(figsize=settings.pop("figsize"), layout="tight")
+    return figure, figure.subplots(rows, columns, squeeze=False, **settings)
+
+
+def styled() -> Any:
+    """A context in which figures have mampc's style."""
     try:
         import matplotlib
     except ImportError:
         raise MampcError("figures need matplotlib: pip install 'mampc[plot]'") from None
-    if matplotlib.get_backend().lower() != "agg":
-        matplotlib.use("agg", force=False)
-    import matplotlib.pyplot
+    return matplotlib.rc_context(STYLE)
 
-    return matplotlib.pyplot
+
+def label(name: str) -> str:
+    """A name as matplotlib shows it literally: a dollar sign starts no formula."""
+    return name.replace("$", r"\$")

@@ -26,13 +26,18 @@ class Estimate:
 
 
 class KalmanFilter:
-    """A stationary Kalman filter for a model augmented with integrating disturbances.
+    """A stationary Kalman filter for a model augmented with one integrating disturbance per output.
 
-    Build it with `offset_free`. The gain is that of the stationary error covariance.
+    Build it with `offset_free`.
+
+    Args:
+        model: the discrete model.
+        directions: how the l disturbances act: (m, l) at the inputs, or None for at the outputs.
+        gain: from innovation to state and disturbances, shape (n + l, l).
     """
 
-    def __init__(self, model: StateSpace, kind: str, gain: Array) -> None:
-        self.model, self.kind, self.gain = model, kind, gain
+    def __init__(self, model: StateSpace, directions: Array | None, gain: Array) -> None:
+        self.model, self.directions, self.gain = model, directions, gain
 
     @classmethod
     def offset_free(
@@ -52,10 +57,11 @@ class KalmanFilter:
         Args:
             model: a discrete model.
             disturbance: "output" for steps at the outputs (stable models), "input" for steps at the
-                inputs (integrating models too; needs at least as many inputs as outputs).
+                inputs (integrating models too; needs at least as many inputs as outputs; with more of
+                them, disturbances act along the inputs' combinations that move the outputs).
             measurement_noise: standard deviation of the noise of each output, scalar or (l,).
             drift: standard deviation by which each disturbance wanders in a sample, in the unit of
-                `measurement_noise` (for "input": as seen through the model's gain), scalar or (l,)/(m,).
+                `measurement_noise` (for "input": as seen through the model's gain), scalar or (l,).
             input_noise: standard deviation of noise at the inputs, scalar or (m,), in input units; the
                 default is what moves the outputs at rest by about the measurement noise.
 
@@ -71,19 +77,20 @@ class KalmanFilter:
             raise MampcError(f"disturbance: expected 'output' or 'input', received {disturbance!r}")
         n, m, l = model.n_states, model.n_inputs, model.n_outputs
         at_output = disturbance == "output"
-        d = l if at_output else m
         if not at_output and m < l:
             raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")
-        A, C = _augmented(model, at_output)
+        response = _response(model)
+        size = float(np.sqrt(np.mean(response**2))) or 1.0
+        directions = None if at_output else np.eye(m) if m == l else response.T / (size * np.sqrt(l))
+        A, C = _augmented(model, directions)
         _require_detectable(A, C, at_output)
         noise = _positive("measurement_noise", measurement_noise, l)
-        size = _gain_size(model)
         excitation = noise.mean() / size if input_noise is None else _positive("input_noise", input_noise, m)
-        wander = _positive("drift", drift, d) * (1.0 if at_output else 1 / size)
+        wander = _positive("drift", drift, l) * (1.0 if at_output else 1 / size)
         from scipy.linalg import solve_discrete_are
 
         driven = model.B[:, :m] * excitation
-        Q = np.zeros((n + d, n + d))
+        Q = np.zeros((n + l, n + l))
         Q[:n, :n] = driven @ driven.T + 1e-10 * np.trace(driven @ driven.T) * np.eye(n)
         Q[n:, n:] = np.diag(wander**2)
         R = np.diag(noise**2)
@@ -94,20 +101,24 @@ class KalmanFilter:
                 f"offset_free: expected a detectable model, the Riccati equation failed: {error}"
             ) from None
         gain = np.linalg.solve(C @ P @ C.T + R, C @ P).T
-        return cls(model, disturbance, gain)
+        return cls(model, directions, gain)
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> Estimate:
         """At rest under inputs u (m,) and measured disturbances v (d,), default those of the operating
-        point; with measurements y (l,) the output disturbance explains them.
+        point; with measurements y (l,) the disturbances explain them.
         """
         model = self.model
-        none = Estimate(np.zeros(model.n_states), np.zeros(model.n_outputs), np.zeros(model.n_inputs))
-        inputs = np.concatenate([u, model.v_op if v is None else v])
-        rest = replace(none, x=model.steady_state(inputs))
-        if y is None or self.kind != "output":
-            return rest
-        unexplained = as_vector("y", y, model.n_outputs) - self._output(rest, self._change(rest, u, v))
-        return replace(rest, output_disturbance=unexplained)
+        n, m, l = model.n_states, model.n_inputs, model.n_outputs
+        none = Estimate(np.zeros(n), np.zeros(l), np.zeros(m))
+        change = self._change(none, u, v)
+        if y is None:
+            return replace(none, x=model.steady_state(np.concatenate([u, model.v_op if v is None else v])))
+        # x = A x + B change + (disturbances), y = y_op + C x + D change + (disturbances)
+        A, C = _augmented(model, self.directions)
+        at_rest = np.vstack([np.eye(n, n + l) - A[:n], C])
+        wanted = np.concatenate([model.B @ change, as_vector("y", y, l) - model.y_op - model.D @ change])
+        rest = np.linalg.lstsq(at_rest, wanted)[0]
+        return self._disturbed(replace(none, x=rest[:n]), rest[n:])
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> Estimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since; what is estimated stays."""
@@ -120,10 +131,13 @@ class KalmanFilter:
         """
         correction = self.gain @ (y - self._output(predicted, self._change(predicted, u, v)))
         n = self.model.n_states
-        x = predicted.x + correction[:n]
-        if self.kind == "output":
-            return Estimate(x, predicted.output_disturbance + correction[n:], predicted.input_disturbance)
-        return Estimate(x, predicted.output_disturbance, predicted.input_disturbance + correction[n:])
+        return self._disturbed(replace(predicted, x=predicted.x + correction[:n]), correction[n:])
+
+    def _disturbed(self, estimate: Estimate, further: Array) -> Estimate:
+        """The estimate with further disturbances, shape (l,)."""
+        if self.directions is None:
+            return replace(estimate, output_disturbance=estimate.output_disturbance + further)
+        return replace(estimate, input_disturbance=estimate.input_disturbance + self.directions @ further)
 
     def _change(self, estimate: Estimate, u: Array, v: Array | None) -> Array:
         """All inputs of the model as differences from the operating point, shape (m + d,)."""
@@ -139,14 +153,13 @@ class KalmanFilter:
         return y
 
 
-def _augmented(model: StateSpace, at_output: bool) -> tuple[Array, Array]:
+def _augmented(model: StateSpace, directions: Array | None) -> tuple[Array, Array]:
     """A and C of the model with integrating disturbances as further states."""
     n, m, l = model.n_states, model.n_inputs, model.n_outputs
-    if at_output:
-        A = np.block([[model.A, np.zeros((n, l))], [np.zeros((l, n)), np.eye(l)]])
-        return A, np.hstack([model.C, np.eye(l)])
-    A = np.block([[model.A, model.B[:, :m]], [np.zeros((m, n)), np.eye(m)]])
-    return A, np.hstack([model.C, model.D[:, :m]])
+    at_states = np.zeros((n, l)) if directions is None else model.B[:, :m] @ directions
+    at_outputs = np.eye(l) if directions is None else model.D[:, :m] @ directions
+    A = np.block([[model.A, at_states], [np.zeros((l, n)), np.eye(l)]])
+    return A, np.hstack([model.C, at_outputs])
 
 
 def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
@@ -164,13 +177,13 @@ def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
                 )
 
 
-def _gain_size(model: StateSpace) -> float:
-    """A typical output change per unit of input: root mean square gain at rest, or after 100 samples."""
+def _response(model: StateSpace) -> Array:
+    """Output changes per unit of input, shape (l, m): at rest, or after 10 samples where none comes."""
     try:
         gain = model.dc_gain()
     except MampcError:
-        gain = np.sum([model.C @ np.linalg.matrix_power(model.A, k) @ model.B for k in range(100)], axis=0)
-    return float(np.sqrt(np.mean(gain[:, : model.n_inputs] ** 2))) or 1.0
+        gain = np.sum([model.C @ np.linalg.matrix_power(model.A, k) @ model.B for k in range(10)], axis=0)
+    return gain[:, : model.n_inputs]
 
 
 def _positive(name: str, value: Any, size: int) -> Array:

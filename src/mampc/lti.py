@@ -19,6 +19,7 @@ import numpy as np
 
 from mampc.arrays import Array, ComplexArray, as_array, as_matrix, as_number, as_vector
 from mampc.errors import MampcError
+from mampc.files import written_whole
 from mampc.names import Names, require_count
 
 MODEL_FILE_LIMIT = 16 * 2**20  # bytes; a 1000-state model fits with room to spare
@@ -243,10 +244,8 @@ class StateSpace:
             **{k: np.asarray(getattr(self, k)).tolist() for k in arrays},
             "names": {k: list(names) for k, names in asdict(self.names).items()},
         }
-        target = Path(path)
-        partial = target.with_name(f".{target.name}.partial")
-        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        partial.replace(target)
+        with written_whole(path) as unfinished:
+            unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> StateSpace:

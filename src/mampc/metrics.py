@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mampc.arrays import Array
-from mampc.errors import MampcError
-
-SAME = 1e-9  # two inputs nearer than this are the same input: rounding is no move
+from mampc.arrays import Array, as_number, as_whole
+from mampc.patterns import SAME
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +56,8 @@ def compute(
     Raises:
         MampcError: skip or threshold out of range.
     """
-    if not 0 <= skip < len(u):
-        raise MampcError(f"skip: expected a whole number of samples within 0..{len(u) - 1}, received {skip}")
-    if not threshold >= 0:
-        raise MampcError(f"threshold: expected a number at or above zero, received {threshold}")
+    skip = as_whole("skip", skip, 0, len(u) - 1)
+    threshold = as_number("threshold", threshold, 0.0)
     changes = np.diff(np.vstack([u_initial, u]), axis=0)[skip:]
     size = np.abs(changes)
     steps, moved = len(size), size > SAME

@@ -29,9 +29,9 @@ class Names:
             if len(set(names)) != len(names):
                 raise MampcError(f"names.{kind}: expected distinct names, received {names!r}")
             object.__setattr__(self, kind, names)
-        shared = set(self.inputs) & set(self.disturbances)
-        if shared:
-            raise MampcError(f"names: expected inputs and disturbances to differ, received {shared} in both")
+        together = (*self.inputs, *self.disturbances, *self.outputs)
+        if len(set(together)) != len(together):
+            raise MampcError(f"names: expected each input, disturbance and output once, received {together}")
 
     @classmethod
     def numbered(cls, inputs: int, outputs: int, states: int = 0) -> Names:

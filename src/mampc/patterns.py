@@ -8,6 +8,8 @@ import numpy as np
 
 from mampc.arrays import Array, as_whole
 
+SAME = 1e-9  # in input units: inputs nearer than this are the same, so that rounding is no move
+
 
 @dataclass(frozen=True, kw_only=True)
 class MoveRules:
@@ -41,5 +43,5 @@ class MoveRules:
         """How many of the `available` future moves the budget still allows: max(0, s - past moves)."""
         if self.max_moves is None:
             return available
-        past = int(np.count_nonzero(self.past_changes(inputs)))
+        past = int(np.count_nonzero(np.abs(self.past_changes(inputs)) > SAME))
         return min(available, max(0, self.max_moves - past))

@@ -11,6 +11,7 @@ from mampc.arrays import as_limit, as_number, as_weight, as_whole
 from mampc.errors import MampcError
 from mampc.lti import StateSpace
 
+MOST_MOVES = 1000  # future moves of all inputs together
 LONGEST_HORIZON = 2000  # samples; a condensed problem beyond it is a mistake rather than a wish
 
 
@@ -45,6 +46,8 @@ class Limits:
                 raise MampcError(f"limits: expected {low} <= {high}, received {lower} and {upper}")
         if (limits.du_max < 0).any():
             raise MampcError(f"limits: expected du_max >= 0, received {limits.du_max}")
+        for name in ("u_min", "u_max", "du_max", "y_min", "y_max"):
+            getattr(limits, name).flags.writeable = False
         return limits
 
 
@@ -57,8 +60,9 @@ class TrackingProblem:
                    y_min - e <= y_i <= y_max + e               i = 1..np
 
     with du_j = u_j - u_{j-1} and the input held at its last value beyond the control horizon. The
-    violation e >= 0, one value per output for the whole horizon, costs w (e + e^2 / 2): an exact
-    penalty, zero whenever the limits can be kept and w is large enough.
+    violation e >= 0, one value per output for the whole horizon, costs w (a + a^2 / 2) with a = sqrt(q) e, q
+    being the output's own weight (at least that of the moves, seen through the model): an exact penalty,
+    zero whenever the limits can be kept and w is large enough.
 
     Args:
         model: a discrete-time `StateSpace`.
@@ -68,7 +72,7 @@ class TrackingProblem:
         move_weight: R (the paper's lambda); a scalar, one value per input, or an (m, m) matrix.
         limits: input, move and output limits, in engineering units.
         weigh_first_move: False leaves du_0 without weight, as the paper prints it (sum from j = 1).
-        output_limit_weight: w, in cost per unit of violation; default 1e4 times the largest output weight.
+        output_limit_weight: w, up to 1e8: how many times tracking a violation counts.
 
     Raises:
         MampcError: anything that does not fit the model or the horizons.
@@ -81,7 +85,7 @@ class TrackingProblem:
     move_weight: Any = field(default=0.1, kw_only=True)
     limits: Limits = field(default=Limits(), kw_only=True)
     weigh_first_move: bool = field(default=True, kw_only=True)
-    output_limit_weight: float = field(default=None, kw_only=True)  # type: ignore[assignment]
+    output_limit_weight: float = field(default=1e4, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, StateSpace):
@@ -98,10 +102,13 @@ class TrackingProblem:
         Q = as_weight("output_weight", self.output_weight, l)
         if not isinstance(self.limits, Limits):
             raise MampcError(f"limits: expected mampc.Limits, received {type(self.limits).__name__}")
-        if self.output_limit_weight is None:
-            weight = 1e4 * max(float(np.max(np.abs(Q))), 1e-8)
-        else:
-            weight = as_number("output_limit_weight", self.output_limit_weight, 0.0, exclusive=True)
+        weight = as_number("output_limit_weight", self.output_limit_weight, 0.0, exclusive=True)
+        if weight > 1e8:
+            raise MampcError(f"output_limit_weight: expected at most 1e8, received {weight:g}")
+        if n_c * m > MOST_MOVES:
+            raise MampcError(
+                f"control_horizon: expected at most {MOST_MOVES} future moves, received {n_c} x {m} inputs"
+            )
         for name, value in {
             "prediction_horizon": n_p,
             "control_horizon": n_c,
@@ -110,4 +117,6 @@ class TrackingProblem:
             "limits": self.limits.checked(m, l),
             "output_limit_weight": weight,
         }.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
             object.__setattr__(self, name, value)

@@ -52,7 +52,7 @@ class DaqpSolver:
         self._f_shape = (program.n_variables,)
         self._bound_shape = (program.n_bounds,)
         self._local = threading.local()
-        self._local.model = self._fresh_model()
+        self._local.model = self._fresh_model() if program.n_bounds else None
 
     def solve(self, f: Array, lower: Array, upper: Array) -> QPSolution:
         """Minimise for the linear term f, shape (n,), and bounds, shape (n_simple + rows,).
@@ -70,6 +70,8 @@ class DaqpSolver:
         # lower <= upper is false for not-a-number too.
         if not (np.isfinite(f).all() and (lower <= upper).all()):
             return _BAD_DATA
+        if not len(lower):  # daqp wants at least one row
+            return QPSolution(-np.linalg.solve(self.program.H, f), lower, QPStatus.OPTIMAL, 0)
         model = getattr(self._local, "model", None)
         if model is None:
             model = self._local.model = self._fresh_model()

@@ -101,6 +101,8 @@ class Regulator:
         u_previous = memory.inputs[-1]
         estimate = self.estimator.predict(state.estimate, u_previous, v_last)
         usable = is_usable(y)
+        if not is_usable(estimate.x):  # it ran away without measurements: start again
+            estimate = self.estimator.initial(u_previous, y if usable else None, v_last)
         if usable:
             estimate = self.estimator.correct(estimate, u_previous, y, v)  # y shows v at once, u later
         decision = self.controller.step(

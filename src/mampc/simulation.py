@@ -15,6 +15,7 @@ from mampc import metrics
 from mampc.arrays import Array, as_array, as_matrix, as_vector, as_whole
 from mampc.controllers.decision import Decision
 from mampc.errors import MampcError
+from mampc.files import written_whole
 from mampc.lti import StateSpace
 from mampc.metrics import Metrics
 from mampc.names import Names
@@ -86,16 +87,13 @@ class Run:
             "status", "objective", "iterations", "solve_time_us",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
-        target = Path(path)
-        unfinished = target.with_name(f".{target.name}.partial")
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
+        with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)
             for row, d in zip(numbers, self.decisions, strict=True):
                 writer.writerow(
                     [*row, d.status.value, d.objective, d.iterations, round(d.solve_time * 1e6, 2)]
                 )
-        unfinished.replace(target)
 
 
 def simulate(
@@ -140,12 +138,15 @@ def simulate(
             f"simulate: expected a plant with {m} inputs, {l} outputs and {model.n_disturbances} measured "
             f"disturbances, received {len(plant.names.inputs)}, {len(plant.names.outputs)} and {d}"
         )
-    r = _trajectory("reference", reference, l, steps)
-    T = len(r)
+    T = _length(reference, steps)
+    rows = _trajectory("reference", reference, l, None if np.ndim(reference) == 2 else T)
+    horizon = regulator.controller.problem.prediction_horizon
+    known = rows[np.minimum(np.arange(T + horizon), len(rows) - 1)]
+    r = known[:T]
     spread = as_vector("noise", noise, l)
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
-    wobble = spread * np.random.default_rng(seed).standard_normal((T, l))
+    wobble = spread * np.random.default_rng(as_whole("seed", seed, 0)).standard_normal((T, l))
     at_inputs = _trajectory("input_disturbance", _default(input_disturbance, 0.0), m, T)
     at_outputs = _trajectory("output_disturbance", _default(output_disturbance, 0.0), l, T)
     usual = getattr(plant, "v_op", np.zeros(d))
@@ -157,12 +158,11 @@ def simulate(
     told: list[dict[str, Any]] = [{"measured_disturbance": now} if model.n_disturbances else {} for now in v]
     y = output(x, np.concatenate([start, v[0]]))
     state = regulator.initial_state(start, y, **told[0])
-    horizon = regulator.controller.problem.prediction_horizon
     inputs, outputs, decisions, found = np.empty((T, m)), np.empty((T, l)), [], {}
     u = start
     for k in _watched(T, progress):
         outputs[k] = output(x, np.concatenate([u + at_inputs[k], v[k]])) + at_outputs[k]
-        ahead = r[np.minimum(np.arange(k, k + horizon + 1), T - 1)] if preview else r[k]
+        ahead = known[k : k + horizon + 1] if preview else r[k]
         decision = regulator.step(state, outputs[k] + wobble[k], ahead, **told[k])
         state, u = decision.state, decision.u
         inputs[k] = u
@@ -175,6 +175,16 @@ def simulate(
         t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + wobble, r=r, u_initial=start,
         decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found,
     )  # fmt: skip
+
+
+def _length(reference: Any, steps: int | None) -> int:
+    if steps is not None:
+        return as_whole("steps", steps, 1)
+    if np.ndim(reference) != 2:
+        raise MampcError(
+            "steps: expected a number of samples, since the reference is constant, received none"
+        )
+    return len(reference)
 
 
 def _default(value: Any, otherwise: Any) -> Any:

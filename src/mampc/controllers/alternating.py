@@ -25,7 +25,7 @@ from mampc.controllers.decision import ControllerState, Status
 from mampc.controllers.pattern_solver import PatternSolver
 from mampc.errors import MampcError
 from mampc.patterns import MoveRules
-from mampc.qp import QPStatus, QuadraticProgram
+from mampc.qp import QPSolution, QPStatus, QuadraticProgram
 from mampc.qp_daqp import DaqpSolver
 
 HIGHEST_PENALTY = 1e10  # a growing mu stops here: beyond it the first step loses its digits
@@ -100,20 +100,20 @@ class AlternatingSearch:
                 if (
                     growth == 1.0
                     or np.abs(d - v).max() <= settings.tolerance
-                    or first_step.mu > HIGHEST_PENALTY
+                    or first_step.mu >= HIGHEST_PENALTY
                 ):
                     settled = True
                     break
-                first_step = self._first_step(first_step.mu * growth)
+                first_step = self._first_step(min(first_step.mu * growth, HIGHEST_PENALTY))
                 sample = first_step.begin(instance)
             u_last = u
         m = len(instance.u_previous)
         guess = np.concatenate([v[m:], np.zeros(m)]).reshape(-1, m)
         if settings.polish:
             polished = self._polished(instance, state, d, pattern)
-            if polished is None:
-                return Plan(None, Status.HELD_SOLVER_FAILED, rounds)
-            d = polished
+            if polished.z is None:
+                return Plan(None, HELD_BY[polished.status], rounds)
+            d = polished.z
         status = (
             Status.ITERATION_LIMIT if not settled else Status.FEASIBLE if settings.polish else Status.SETTLED
         )
@@ -121,14 +121,14 @@ class AlternatingSearch:
 
     def _polished(
         self, instance: Instance, state: ControllerState, d: Array, pattern: BoolArray
-    ) -> Array | None:
+    ) -> QPSolution:
         """The best moves on the pattern, cut to the budget that the applied moves leave."""
         left = self.rules.moves_left(state.inputs, len(d))
         if np.count_nonzero(pattern) > left:
             on_pattern = np.where(pattern, np.abs(d), -1.0)
             pattern = np.zeros(len(d), dtype=bool)
             pattern[np.argsort(-on_pattern, kind="stable")[:left]] = True
-        return self._polisher.solve(instance, pattern).z
+        return self._polisher.solve(instance, pattern)
 
     def _first_step(self, mu: float) -> FirstStep:
         step = self._first_steps.get(mu)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.arrays import Array, as_array, as_vector, is_usable
+from mampc.arrays import LARGEST, Array, as_array, as_vector, is_usable
 from mampc.condensing import CondensedQP, Instance
 from mampc.controllers.decision import ControllerState, Decision, Status
 from mampc.errors import MampcError
@@ -58,7 +59,11 @@ class Controller(ABC):
         self.condensed = CondensedQP(problem)
         self._solver = DaqpSolver(self.condensed.program)
         limits, model = problem.limits, problem.model
-        self._u_min, self._u_max = limits.u_min, limits.u_max
+        # Without limits of their own inputs still stay within what counts as a number.
+        self._u_min, self._u_max = (
+            np.maximum(limits.u_min, -LARGEST / 2),
+            np.minimum(limits.u_max, LARGEST / 2),
+        )
         self._shape = (problem.control_horizon, model.n_inputs)
         self._x_shape = (model.n_states,)
         self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
@@ -113,6 +118,7 @@ class Controller(ABC):
             MampcError: arrays of the wrong shape.
         """
         start = perf_counter()
+        disturbances = output_disturbance, input_disturbance, measured_disturbance
         x = np.asarray(x, dtype=np.float64)
         reference = np.asarray(reference, dtype=np.float64)
         if x.shape != self._x_shape:
@@ -121,44 +127,70 @@ class Controller(ABC):
             raise MampcError(
                 f"reference: expected shape {self._reference_shapes}, received {reference.shape}"
             )
+        planned_from = self._planned_from(state)
+        plan, instance = self._planned(planned_from, x, reference, disturbances)
+        if plan.status is Status.HELD_INFEASIBLE and planned_from is state:
+            # Inputs outside their limits may be too far to go back within du_max: the limits come first.
+            planned_from = self._brought_inside(state)
+            plan, instance = self._planned(planned_from, x, reference, disturbances)
+        return self._decide(plan, instance, state, start)
+
+    def _planned(
+        self, state: ControllerState, x: Array, reference: Array, disturbances: tuple[Any, Any, Any]
+    ) -> tuple[Plan, Instance | None]:
         u_previous = state.inputs[-1]
-        parameter = self.condensed.parameter(
-            x, u_previous, reference, output_disturbance, input_disturbance, measured_disturbance
-        )
+        parameter = self.condensed.parameter(x, u_previous, reference, *disturbances)
         if not is_usable(parameter):
-            return self._decide(Plan(None, Status.HELD_BAD_MEASUREMENT, 0), None, state, start)
+            return Plan(None, Status.HELD_BAD_MEASUREMENT, 0), None
         instance = self.condensed.instance(parameter, u_previous)
-        return self._decide(self._plan(instance, state), instance, state, start)
+        return self._plan(instance, state), instance
+
+    def _planned_from(self, state: ControllerState) -> ControllerState:
+        """The state that plans start from; the state itself unless a method wants another."""
+        return state
+
+    def _brought_inside(self, state: ControllerState) -> ControllerState:
+        """The state to plan from where the applied inputs are outside their limits: they go back at once.
+
+        That is a move like any other, so it stands in the window of the rules as the latest one.
+        """
+        inside = np.clip(state.inputs[-1:], self._u_min, self._u_max)
+        kept = state.inputs[1:] if len(state.inputs) > 1 else state.inputs[:0]
+        return replace(state, inputs=np.concatenate([kept, inside]))
 
     @abstractmethod
     def _plan(self, instance: Instance, state: ControllerState) -> Plan:
         """Search the moves for one sample's data."""
 
-    def _price(self, changes: Array) -> float:
-        """What the moves cost beside the quadratic program."""
-        return 0.0
-
     def _decide(
         self, plan: Plan, instance: Instance | None, state: ControllerState, start: float
     ) -> Decision:
         moves, status, iterations, lower_bound, guess, inputs, objective = plan
+        u_previous = state.inputs[-1]
         if moves is None or instance is None:
             moves = np.zeros(self.condensed.n_moves)
             objective, lower_bound = np.nan, -np.inf
-        elif objective is None:
-            objective = self.condensed.cost(instance, moves)
+            start_from = u_previous
+        else:
+            start_from = instance.u_previous
+            if objective is None:
+                objective = self.condensed.cost(instance, moves)
         if lower_bound is None:
             lower_bound = objective
+        changes = moves.reshape(self._shape)
         if inputs is None:
-            inputs = self.condensed.cumulate @ moves
-            inputs.reshape(self._shape)[...] += state.inputs[-1]
-            inputs = np.minimum(np.maximum(inputs.reshape(self._shape), self._u_min), self._u_max)
+            inputs = (self.condensed.cumulate @ moves).reshape(self._shape) + start_from
+            inputs = np.minimum(np.maximum(inputs, self._u_min), self._u_max)
         else:
             inputs = inputs.reshape(self._shape)
+        if start_from is not u_previous:  # the way back inside is part of the plan
+            changes = changes + np.concatenate([[start_from - u_previous], np.zeros_like(changes[1:])])
+        # What is handed out is also what is remembered.
+        inputs.flags.writeable = changes.flags.writeable = False
         u, history = inputs[0], state.inputs
         history = inputs[:1] if len(history) == 1 else np.concatenate((history[1:], inputs[:1]))
         return Decision(
-            u, inputs, moves.reshape(self._shape), status, objective, lower_bound, iterations,
+            u, inputs, changes, status, objective, lower_bound, iterations,
             perf_counter() - start, ControllerState(history, state.samples + 1, guess),
         )  # fmt: skip
 

@@ -39,7 +39,7 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ControllerState:
-    """What a controller remembers: plain numbers, safe to copy, pickle and compare.
+    """What a controller remembers: plain numbers, safe to copy and pickle.
 
     Attributes:
         inputs: the inputs applied so far, oldest first, shape (h, m); the last row is u_{k-1}.
@@ -54,15 +54,15 @@ class ControllerState:
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """One sample's decision, in engineering units.
+    """One sample's decision, in engineering units; its arrays are read-only.
 
     Attributes:
         u: inputs to apply now, shape (m,); always finite and within the input limits.
         plan: planned inputs, shape (nc, m); its first row is `u`.
-        changes: planned moves du, shape (nc, m); entries off the chosen pattern are exactly zero.
+        changes: planned moves du, shape (nc, m); with an exact pattern (polish) zero off it.
         status: how the decision came about.
         objective: cost of the plan: tracking over i = 0..np, move weights over j = 0..nc-1, output-limit
-            penalty and price of the moves; not-a-number where nothing was solved.
+            penalty; not-a-number where nothing was solved.
         lower_bound: no admissible plan costs less; minus infinity where nothing is proven.
         iterations: solver iterations (MPC) or rounds of the method.
         solve_time: seconds from call to answer.

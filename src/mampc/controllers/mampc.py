@@ -59,6 +59,12 @@ class MAMPC(Controller):
     def memory(self) -> int:
         return self.rules.sparsity_horizon
 
+    def _planned_from(self, state: ControllerState) -> ControllerState:
+        """A pattern says which inputs move, so none may be outside its limits when it is chosen."""
+        last = state.inputs[-1]
+        inside = (last <= self._u_max).all() and (last >= self._u_min).all()
+        return state if inside else self._brought_inside(state)
+
     def _plan(self, instance: Instance, state: ControllerState) -> Plan:
         if state.samples >= self._search.warm_up:
             return self._search.plan(instance, state)

@@ -12,6 +12,7 @@ import numpy as np
 
 from mampc.arrays import Array, as_array, as_matrix, as_number, as_vector, as_whole
 from mampc.errors import MampcError
+from mampc.files import written_whole
 from mampc.lti import StateSpace
 from mampc.names import Names, require_count
 from mampc.plants import Plant, advance
@@ -77,14 +78,11 @@ class IOData:
 
     def to_csv(self, path: str | Path) -> None:
         """Write a header `time,inputs,outputs` and one row per sample, in full precision."""
-        target = Path(path)
-        partial = target.with_name(f".{target.name}.partial")
-        with partial.open("w", newline="", encoding="utf-8") as file:
+        time = np.arange(len(self))[:, None] * self.dt
+        with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(["time", *self.names.inputs, *self.names.disturbances, *self.names.outputs])
-            time = np.arange(len(self))[:, None] * self.dt
             writer.writerows(np.hstack([time, self.u, self.y]).tolist())
-        partial.replace(target)
 
     @classmethod
     def from_csv(
@@ -109,7 +107,10 @@ class IOData:
                 an uneven `time` column where dt is taken from it.
         """
         header, rows = _read_csv(Path(path))
-        names = Names(tuple(inputs), tuple(outputs), disturbances=tuple(disturbances))
+        given = [
+            (group,) if isinstance(group, str) else tuple(group) for group in (inputs, outputs, disturbances)
+        ]
+        names = Names(given[0], given[1], disturbances=given[2])
         all_inputs = names.inputs + names.disturbances
         columns = {}
         for name in (*all_inputs, *names.outputs, *(["time"] if dt is None else [])):
@@ -175,6 +176,10 @@ def excite(
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
     y = y + spread * np.random.default_rng(as_whole("seed", seed, 0)).standard_normal(y.shape)
     return IOData(signal, y, dt, names)
+
+
+def _listed(names: Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def _column(name: str, value: Any) -> Array:

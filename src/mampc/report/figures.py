@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mampc.arrays import Array
-from mampc.drawing import COLOURS, STYLE, WIDE, pyplot, time_scale
+from mampc.drawing import COLOURS, WIDE, label, new_figure, styled, time_scale
 from mampc.identification import IOData, Validation
 from mampc.simulation import Run
 from mampc.study import StudyResult
@@ -30,38 +30,33 @@ def study_figures(result: StudyResult) -> Iterator[tuple[str, Figure]]:
         yield "prbs-outputs", _record_figure(result.data, names.outputs, result.data.y, staircase=False)
     for scenario, runs in result.runs.items():
         for i, name in enumerate(names.inputs):
-            yield f"{file_word(scenario)}-{file_word(name)}", _comparison(runs, i, name, "input")
+            yield f"{file_word(scenario)}_{file_word(name)}", _comparison(runs, i, name, "input")
         for i, name in enumerate(names.outputs):
-            yield f"{file_word(scenario)}-{file_word(name)}", _comparison(runs, i, name, "output")
-        yield f"{file_word(scenario)}-moves-against-error", moves_against_error(runs, result.study.threshold)
+            yield f"{file_word(scenario)}_{file_word(name)}", _comparison(runs, i, name, "output")
+        yield f"{file_word(scenario)}_moves-against-error", moves_against_error(runs, result.study.threshold)
 
 
 def validation_figure(data: IOData, validation: Validation) -> Figure:
     """Measured and simulated outputs of a record the model has not seen."""
-    plt = pyplot()
     l = data.y.shape[1]
-    with plt.rc_context(STYLE):
-        figure: Figure
-        figure, axes = plt.subplots(l, 1, figsize=(6.5, 1.0 + 1.6 * l), sharex=True, squeeze=False)
+    with styled():
+        figure, axes = new_figure(l, 1, figsize=(6.5, 1.0 + 1.6 * l), sharex=True)
         time = np.arange(len(data)) * data.dt
         scale, unit = time_scale(time)
         for i, panel in enumerate(axes[:, 0]):
             panel.plot(time / scale, data.y[:, i], color=COLOURS[0], label="measured")
             panel.plot(time / scale, validation.y_hat[:, i], color=COLOURS[1], label="simulated by the model")
-            panel.set_ylabel(data.names.outputs[i])
+            panel.set_ylabel(label(data.names.outputs[i]))
             panel.set_title(f"fit {validation.fit[i]:.1f} %", loc="right")
         axes[0, 0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
         axes[-1, 0].set_xlabel(f"time ({unit}), hold-out part of the record")
-        figure.tight_layout()
     return figure
 
 
 def _comparison(runs: dict[str, Run], i: int, name: str, kind: str) -> Figure:
     """One signal of several runs."""
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure: Figure
-        figure, panel = plt.subplots(figsize=WIDE)
+    with styled():
+        figure, [[panel]] = new_figure(figsize=WIDE)
         first = next(iter(runs.values()))
         scale, unit = time_scale(first.t)
         if kind == "output":
@@ -71,26 +66,23 @@ def _comparison(runs: dict[str, Run], i: int, name: str, kind: str) -> Figure:
             )  # fmt: skip
         for (controller, run), colour in zip(runs.items(), _colours(), strict=False):
             if kind == "input":
-                panel.step(run.t / scale, run.u[:, i], where="post", color=colour, label=controller)
+                panel.step(run.t / scale, run.u[:, i], where="post", color=colour, label=label(controller))
             else:
-                panel.plot(run.t / scale, run.y[:, i], color=colour, label=controller)
+                panel.plot(run.t / scale, run.y[:, i], color=colour, label=label(controller))
         _label(panel, name, unit)
-        figure.tight_layout()
     return figure
 
 
 def moves_against_error(runs: dict[str, Run], threshold: float) -> Figure:
     """Each controller as a point: how often its inputs change, and how well its outputs follow."""
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure: Figure
-        figure, panel = plt.subplots(figsize=(4.2, 3.2))
+    with styled():
+        figure, [[panel]] = new_figure(figsize=(4.2, 3.2))
         for (controller, run), colour in zip(runs.items(), _colours(), strict=False):
             metrics = run.metrics(threshold=threshold)
             share = 100 * float(np.mean(metrics.sparse_density))
             panel.plot(share, metrics.tracking_error, "o", color=colour, markersize=7)
             panel.annotate(
-                controller,
+                label(controller),
                 (share, metrics.tracking_error),
                 xytext=(6, 5),
                 textcoords="offset points",
@@ -101,65 +93,55 @@ def moves_against_error(runs: dict[str, Run], threshold: float) -> Figure:
         panel.margins(x=0.25, y=0.25)
         panel.set_xlim(left=0)
         panel.set_ylim(bottom=0)
-        figure.tight_layout()
     return figure
 
 
 def sensitivity_figure(points: list[Point], settings: dict[str, str]) -> Figure:
     """Ratios to plain MPC as one setting changes at a time, a panel a setting."""
-    plt = pyplot()
     shown = [setting for setting in settings if any(point.setting == setting for point in points)]
     columns = 4
-    with plt.rc_context(STYLE):
+    with styled():
         rows = -(-len(shown) // columns)
-        figure: Figure
-        figure, axes = plt.subplots(rows, columns, figsize=(9.0, 2.3 * rows), squeeze=False, sharey=True)
+        figure, axes = new_figure(rows, columns, figsize=(9.0, 2.3 * rows), sharey=True)
         for panel in axes.flat[len(shown) :]:
             panel.set_visible(False)
         for setting, panel in zip(shown, axes.flat, strict=False):
             own = [point for point in points if point.setting == setting]
             values = [point.value for point in own]
-            for ratios, label, colour in (
+            for ratios, name, colour in (
                 ([point.changes_ratio for point in own], "changes / MPC", COLOURS[1]),
                 ([point.error_ratio for point in own], "error / MPC", COLOURS[2]),
             ):
-                panel.plot(
-                    values, [np.nan if r is None else r for r in ratios], "o-", color=colour, label=label
-                )
+                heights = [np.nan if ratio is None else ratio for ratio in ratios]
+                panel.plot(values, heights, "o-", color=colour, label=name)
             panel.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
             if min(values) > 0 and max(values) / min(values) >= 50:
                 panel.set_xscale("log")
             panel.set_xlabel(settings[setting])
         axes[0, 0].legend(loc="best")
-        figure.tight_layout()
     return figure
 
 
 def _record_figure(data: IOData, names: tuple[str, ...], signals: Array, staircase: bool) -> Figure:
     """The first part of the record, one panel a signal."""
-    plt = pyplot()
     shown = slice(0, SHOWN_OF_EXCITATION)
     time = np.arange(len(data))[shown] * data.dt
     scale, unit = time_scale(time)
-    with plt.rc_context(STYLE):
-        figure: Figure
-        figure, axes = plt.subplots(
-            len(names), 1, figsize=(6.5, 1.0 + 1.3 * len(names)), sharex=True, squeeze=False
-        )
+    with styled():
+        figure, axes = new_figure(len(names), 1, figsize=(6.5, 1.0 + 1.3 * len(names)), sharex=True)
         for i, panel in enumerate(axes[:, 0]):
             if staircase:
                 panel.step(time / scale, signals[shown, i], where="post", color=COLOURS[1], linewidth=1.0)
             else:
                 panel.plot(time / scale, signals[shown, i], color=COLOURS[1], linewidth=1.0)
-            panel.set_ylabel(names[i])
+            panel.set_ylabel(label(names[i]))
         axes[-1, 0].set_xlabel(f"time ({unit})")
-        figure.tight_layout()
     return figure
 
 
 def _label(panel: Axes, name: str, unit: str) -> None:
     panel.set_xlabel(f"time ({unit})")
-    panel.set_ylabel(name)
+    panel.set_ylabel(label(name))
     panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, borderaxespad=0.2)
 
 

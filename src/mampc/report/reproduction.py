@@ -81,7 +81,7 @@ def reproduce(directory: Path, on_stage: Callable[[str], None] = lambda stage: N
         points = sensitivity(
             study,
             study.scenarios[-1],
-            study.controllers[-1],
+            _papers(study)[-1],
             CASES[study.name],
             on_point=_counted(study, on_stage),
         )
@@ -95,6 +95,11 @@ def reproduce(directory: Path, on_stage: Callable[[str], None] = lambda stage: N
         _judge(page, cases)
         page.write(folder, "report")
     return cases
+
+
+def _papers(study: Study) -> list[ControllerTable]:
+    """The controllers that the paper has figures for."""
+    return [table for table in study.controllers if table.published is not None]
 
 
 def _counted(study: Study, on_stage: Callable[[str], None]) -> Callable[[int, int], None]:
@@ -135,7 +140,7 @@ def _write_case(page: Page, case: Case, folder: Path) -> None:
         page.figure(f"{name}/figures/{figure_name}.svg", figure_name.replace("-", " "))
     page.heading(f"Sensitivity: {name}", 3)
     page.text(
-        f"{case.study.controllers[-1].name} in the {case.study.scenarios[-1].name} scenario, one setting "
+        f"{_papers(case.study)[-1].name} in the {case.study.scenarios[-1].name} scenario, one setting "
         "changed at a time; ratios to MPC with the same setting."
     )
     save_figure(sensitivity_figure(case.points, SETTINGS), own / "figures" / "sensitivity")
@@ -170,7 +175,7 @@ def _table(case: Case, part: str | None) -> tuple[list[str], list[list[str]]]:
     for source in ("paper", *(f"ours, {name}" for name in scenarios)):
         header += [f"{source}: density", "error", "changes / MPC", "error / MPC"]
     rows = []
-    for controller in case.study.controllers:
+    for controller in _papers(case.study):
         row = [controller.name]
         for scenario in (None, *scenarios):
             figures = _figures(case, controller, part, scenario)
@@ -214,7 +219,7 @@ def _judge(page: Page, cases: list[Case]) -> None:
     )
     rows, agreed, total = [], 0, 0
     for case in cases:
-        for (part, samples), controller, figure in product(_parts(case), case.study.controllers, FIGURES):
+        for (part, samples), controller, figure in product(_parts(case), _papers(case.study), FIGURES):
             if controller == baseline(case.study):
                 continue
             paper = _figures(case, controller, part, None).ratio(figure)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from mampc.study.schema import ControllerTable, PublishedTable, Study
@@ -28,7 +29,9 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
     base = baseline(study)
     samples = f"all {study.steps} samples" if part is None else f"without the first {study.skip} samples"
     table = Table(
-        title=f"{study.name}, {scenario['name']} — {samples}", title_justify="left", title_style="bold"
+        title=escape(f"{study.name}, {scenario['name']} — {samples}"),
+        title_justify="left",
+        title_style="bold",
     )
     published = any(_published(controller, part) for controller in study.controllers)
     table.add_column("controller", no_wrap=True)
@@ -36,9 +39,11 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
         f"changes\n> {study.threshold:g}",
         "changes\nat all",
         "tracking\nerror",
-        f"changes, error\n/ {base.name}",
+        f"changes, error\n/ {escape(base.name)}",
     ]
-    headers += ["published\nchanges", "published\nerror", f"published\n/ {base.name}"] if published else []
+    headers += (
+        ["published\nchanges", "published\nerror", f"published\n/ {escape(base.name)}"] if published else []
+    )
     for header in [*headers, "step\nµs"]:
         table.add_column(header, justify="right", no_wrap=True)
     entries = {entry["name"]: entry if part is None else entry[part] for entry in scenario["controllers"]}
@@ -47,7 +52,7 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
         entry, reference = entries[controller.name], entries[base.name]
         density = entry["sparse_density"]
         row = [
-            controller.name,
+            escape(controller.name),
             _several(density["per_input"]),
             _several(density["exact_per_input"]),
             f"{entry['tracking_error']:.3f}",

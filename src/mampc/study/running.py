@@ -15,6 +15,7 @@ from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.controllers.mampc import METHODS
 from mampc.errors import MampcError, StudyError
+from mampc.estimation import KalmanFilter
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.lti import StateSpace
 from mampc.patterns import MoveRules
@@ -116,11 +117,16 @@ def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, ta
     model, plant, at, T = prepared.model, prepared.plant, scenario.disturbance_at, study.steps
 
     def disturbance(value: Values | None, usual: Any) -> Any:
-        return None if value is None else steps(T, usual, [(at, value)])
+        if value is None:
+            return None
+        try:
+            return steps(T, usual, [(at, value)])
+        except MampcError as error:
+            raise StudyError(f"scenarios, {scenario.name!r}, disturbances: {error}") from None
 
     return simulate(
         plant,
-        Regulator(_controller(_problem(study, model), table)),
+        Regulator(_controller(_problem(study, model), table), _estimator(study, model)),
         _reference(study, prepared),
         noise=scenario.noise,
         seed=scenario.seed,
@@ -184,13 +190,23 @@ def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
     return MAMPC(problem, MoveRules(**table.rules.model_dump()), method=method)
 
 
+def _estimator(study: Study, model: StateSpace) -> KalmanFilter:
+    try:
+        return KalmanFilter.offset_free(model, **study.estimator.model_dump())
+    except MampcError as error:
+        raise StudyError(f"[estimator] {error}") from None
+
+
 def _reference(study: Study, prepared: Prepared) -> Array:
     table, plant = study.reference, prepared.plant
-    staircase = steps(study.steps, table.initial, [(change.at, change.value) for change in table.changes])
-    if staircase.shape[1] != len(plant.names.outputs):
+    if len(table.initial) != len(plant.names.outputs):
         raise StudyError(
-            f"reference.initial: expected {len(plant.names.outputs)} values, received {staircase.shape[1]}"
+            f"reference.initial: expected {len(plant.names.outputs)} values, received {len(table.initial)}"
         )
+    try:
+        staircase = steps(study.steps, table.initial, [(change.at, change.value) for change in table.changes])
+    except MampcError as error:
+        raise StudyError(f"reference.{error}") from None
     if not table.relative:
         return staircase
     usual = np.concatenate([prepared.u_op, prepared.v_op])

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
 
+from mampc.arrays import LARGEST
 from mampc.controllers.mampc import METHODS
+from mampc.errors import MampcError
 from mampc.plants import QuadrupleTank, SolidOxideFuelCell
 from mampc.problem import LONGEST_HORIZON
 
 PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank, "sofc": SolidOxideFuelCell}
 PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 LONGEST_RUN = 1_000_000  # samples
+LONGEST_EXCITATION = 100_000  # samples
 
 _SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -32,7 +36,7 @@ def _time(value: Any) -> Any:
         raise ValueError(f"a time such as 10.0 or '10 s' (units {', '.join(_SECONDS)})") from None
 
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Time = Annotated[float, BeforeValidator(_time), Field(gt=0, allow_inf_nan=False)]
 Values = Number | list[Number]
@@ -64,6 +68,15 @@ class IdentificationTable(Table):
     noise: Values = 0.0
     seed: Annotated[int, Field(ge=0)] = 1
 
+    @model_validator(mode="after")
+    def _not_endless(self) -> IdentificationTable:
+        samples = (2**self.prbs_order - 1) * self.hold
+        if samples > LONGEST_EXCITATION:
+            raise ValueError(
+                f"at most {LONGEST_EXCITATION} samples of excitation; received prbs_order and hold for {samples}"
+            )
+        return self
+
 
 class LimitsTable(Table):
     u_min: Values | None = None
@@ -80,7 +93,7 @@ class ProblemTable(Table):
     move_weight: Weight = 0.1
     limits: LimitsTable = LimitsTable()
     weigh_first_move: bool = True
-    output_limit_weight: Positive | None = None
+    output_limit_weight: Positive = 1e4
 
 
 class ChangeTable(Table):
@@ -131,7 +144,24 @@ class ControllerTable(Table):
             raise ValueError(f"rules for the method {self.method!r}, such as rules = {{ max_moves = 3 }}")
         if self.method == "mpc" and (self.rules is not None or self.settings):
             raise ValueError("neither rules nor settings for the method 'mpc', which has none")
+        if self.method != "mpc":
+            try:
+                METHODS[self.method](**self.settings)
+            except TypeError:
+                known = ", ".join(field.name for field in fields(METHODS[self.method]))
+                raise ValueError(f"settings among {known}; received {sorted(self.settings)}") from None
+            except MampcError as error:
+                raise ValueError(f"other settings: {error}") from None
+            if self.rules is not None and self.rules.max_moves is None:
+                raise ValueError(f"rules.max_moves for the method {self.method!r}")
         return self
+
+
+class EstimatorTable(Table):
+    disturbance: Literal["output", "input"] = "output"
+    measurement_noise: Values = 1.0
+    drift: Values = 0.3
+    input_noise: Values | None = None
 
 
 class Study(Table):
@@ -146,6 +176,7 @@ class Study(Table):
     identification: IdentificationTable | None = None
     model: ModelTable | None = None
     problem: ProblemTable
+    estimator: EstimatorTable = EstimatorTable()
     reference: ReferenceTable
     scenarios: Annotated[list[ScenarioTable], Field(min_length=1)]
     controllers: Annotated[list[ControllerTable], Field(min_length=1)]
@@ -175,4 +206,4 @@ class Study(Table):
 
 def file_word(name: str) -> str:
     """A name as it stands in file names."""
-    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+    return re.sub(r"[\W_]+", "-", name.lower()).strip("-")
