@@ -153,3 +153,19 @@ def test_every_parameter_states_unit_and_source():
 def test_parameters_out_of_range_are_refused(wrong):
     with pytest.raises(mampc.MampcError, match="expected"):
         SolidOxideFuelCell(**wrong)
+
+
+def test_a_record_that_moves_the_current_identifies_a_model_that_has_it(tmp_path):
+    signal = mampc.prbs(order=8, amplitude=[5.0, 10.0, 10.0], hold=5, mean=[100.0, 100.0, 400.0])
+    data = mampc.excite(STACK, signal, dt=0.5, noise=0.1)
+    model = mampc.n4sid(data).model
+    assert model.names.disturbances == ("current",)
+    np.testing.assert_allclose(model.v_op, [400.0], atol=1.0)
+    np.testing.assert_allclose(model.dc_gain(), mampc.linearise(STACK).dc_gain(), rtol=0.2)
+    data.to_csv(tmp_path / "record.csv")
+    again = mampc.IOData.from_csv(
+        tmp_path / "record.csv", inputs=["fuel", "air"], disturbances=["current"], outputs=["voltage"]
+    )
+    np.testing.assert_array_equal(again.u, data.u)
+    model.save(tmp_path / "model.json")
+    assert mampc.StateSpace.load(tmp_path / "model.json").names == model.names

@@ -5,7 +5,7 @@ See README.md for ten lines that run, docs/ for the rest.
 
 from mampc import plants
 from mampc.controllers import MAMPC, MPC, Alternating, ControllerState, Decision, Status
-from mampc.errors import MampcError, MampcWarning, StudyError
+from mampc.errors import MampcError, StudyError
 from mampc.estimation import KalmanFilter
 from mampc.identification import Identified, IOData, Validation, excite, n4sid, validate
 from mampc.lti import StateSpace, linearise
@@ -30,7 +30,6 @@ __all__ = [
     "KalmanFilter",
     "Limits",
     "MampcError",
-    "MampcWarning",
     "Metrics",
     "MoveRules",
     "Names",

@@ -1,4 +1,4 @@
-"""What mampc raises and warns with: every message states what was expected and what came."""
+"""What mampc raises: every message states what was expected and what came."""
 
 
 class MampcError(ValueError):
@@ -7,7 +7,3 @@ class MampcError(ValueError):
 
 class StudyError(MampcError):
     """A study file with a wrong key, type, value or unit; the message names each place."""
-
-
-class MampcWarning(UserWarning):
-    """Something that works but is probably not what the user wants, such as an unstable closed loop."""
