@@ -186,8 +186,8 @@ class CondensedQP:
             upper=upper,
         )
         self._constant_map = self._with_constant_reference(self._preview_map)
-        self._undisturbed: tuple[Array, Array, Array] = np.zeros(m), np.zeros(l), model.v_op
-        self._one = np.ones(1)
+        parts: tuple[Array, Array, Array, Array] = np.zeros(m), np.zeros(l), model.v_op, np.ones(1)
+        self._undisturbed_parts, self._undisturbed = parts, np.concatenate(parts)  # (d_u, d_y, v, 1)
 
     def _build_program(self, free: Array, u_previous: Array) -> tuple[Array, Array]:
         """The program, and its bounds as affine maps.
@@ -270,16 +270,18 @@ class CondensedQP:
         measured_disturbance: Any = None,
     ) -> Array:
         """p for one sample; the reference has shape (l,) or (np + 1, l), each disturbance may be left out."""
-        d_u, d_y, v = self._undisturbed
+        if reference.ndim == 2:
+            reference = reference.ravel()
+        if output_disturbance is None and input_disturbance is None and measured_disturbance is None:
+            return np.concatenate((x, u_previous, self._undisturbed, reference))
+        d_u, d_y, v, one = self._undisturbed_parts
         if input_disturbance is not None:
             d_u = _shaped("input_disturbance", input_disturbance, d_u.shape)
         if output_disturbance is not None:
             d_y = _shaped("output_disturbance", output_disturbance, d_y.shape)
         if measured_disturbance is not None:
             v = _shaped("measured_disturbance", measured_disturbance, v.shape)
-        if reference.ndim == 2:
-            reference = reference.ravel()
-        return np.concatenate((x, u_previous, d_u, d_y, v, self._one, reference))
+        return np.concatenate((x, u_previous, d_u, d_y, v, one, reference))
 
     def instance(self, parameter: Array, u_previous: Array) -> Instance:
         """The data of one sample, from its `parameter`."""

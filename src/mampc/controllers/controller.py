@@ -118,7 +118,6 @@ class Controller(ABC):
             MampcError: arrays of the wrong shape.
         """
         start = perf_counter()
-        disturbances = output_disturbance, input_disturbance, measured_disturbance
         x = np.asarray(x, dtype=np.float64)
         reference = np.asarray(reference, dtype=np.float64)
         if x.shape != self._x_shape:
@@ -128,22 +127,20 @@ class Controller(ABC):
                 f"reference: expected shape {self._reference_shapes}, received {reference.shape}"
             )
         planned_from = self._planned_from(state)
-        plan, instance = self._planned(planned_from, x, reference, disturbances)
-        if plan.status is Status.HELD_INFEASIBLE and planned_from is state:
+        while True:
+            u_previous = planned_from.inputs[-1]
+            parameter = self.condensed.parameter(
+                x, u_previous, reference, output_disturbance, input_disturbance, measured_disturbance
+            )
+            if not is_usable(parameter):
+                bad = Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
+                return self._decide(bad, None, state, planned_from, start)
+            instance = self.condensed.instance(parameter, u_previous)
+            plan = self._plan(instance, planned_from)
+            if plan.status is not Status.HELD_INFEASIBLE or planned_from is not state:
+                return self._decide(plan, instance, state, planned_from, start)
             # Inputs outside their limits may be too far to go back within du_max: the limits come first.
             planned_from = self._brought_inside(state)
-            plan, instance = self._planned(planned_from, x, reference, disturbances)
-        return self._decide(plan, instance, state, start)
-
-    def _planned(
-        self, state: ControllerState, x: Array, reference: Array, disturbances: tuple[Any, Any, Any]
-    ) -> tuple[Plan, Instance | None]:
-        u_previous = state.inputs[-1]
-        parameter = self.condensed.parameter(x, u_previous, reference, *disturbances)
-        if not is_usable(parameter):
-            return Plan(None, Status.HELD_BAD_MEASUREMENT, 0), None
-        instance = self.condensed.instance(parameter, u_previous)
-        return self._plan(instance, state), instance
 
     def _planned_from(self, state: ControllerState) -> ControllerState:
         """The state that plans start from; the state itself unless a method wants another."""
@@ -163,30 +160,33 @@ class Controller(ABC):
         """Search the moves for one sample's data."""
 
     def _decide(
-        self, plan: Plan, instance: Instance | None, state: ControllerState, start: float
+        self,
+        plan: Plan,
+        instance: Instance | None,
+        state: ControllerState,
+        planned_from: ControllerState,
+        start: float,
     ) -> Decision:
         moves, status, iterations, lower_bound, guess, inputs, objective = plan
-        u_previous = state.inputs[-1]
         if moves is None or instance is None:
             moves = np.zeros(self.condensed.n_moves)
             objective, lower_bound = np.nan, -np.inf
-            start_from = u_previous
-        else:
-            start_from = instance.u_previous
-            if objective is None:
-                objective = self.condensed.cost(instance, moves)
+        elif objective is None:
+            objective = self.condensed.cost(instance, moves)
         if lower_bound is None:
             lower_bound = objective
         changes = moves.reshape(self._shape)
         if inputs is None:
-            inputs = (self.condensed.cumulate @ moves).reshape(self._shape) + start_from
+            inputs = (self.condensed.cumulate @ moves).reshape(self._shape) + planned_from.inputs[-1]
             inputs = np.minimum(np.maximum(inputs, self._u_min), self._u_max)
         else:
             inputs = inputs.reshape(self._shape)
-        if start_from is not u_previous:  # the way back inside is part of the plan
-            changes = changes + np.concatenate([[start_from - u_previous], np.zeros_like(changes[1:])])
+        if planned_from is not state:  # the way back inside the limits is part of the plan
+            changes = changes.copy()
+            changes[0] += planned_from.inputs[-1] - state.inputs[-1]
         # What is handed out is also what is remembered.
-        inputs.flags.writeable = changes.flags.writeable = False
+        inputs.setflags(write=False)
+        changes.setflags(write=False)
         u, history = inputs[0], state.inputs
         history = inputs[:1] if len(history) == 1 else np.concatenate((history[1:], inputs[:1]))
         return Decision(
