@@ -1,7 +1,6 @@
 """The loop as a whole: estimator and controller on a plant, and what is measured of a run."""
 
 import copy
-import csv
 import pickle
 from dataclasses import replace
 
@@ -292,63 +291,6 @@ def test_arguments_that_do_not_fit_together_are_refused(options):
     plant, reference = arguments.pop("plant"), arguments.pop("reference")
     with pytest.raises(mampc.MampcError, match=r"expected"):
         mampc.simulate(plant, regulator(stable_model()), reference, **arguments)
-
-
-# Measures of a run
-
-
-def hand_made_run():
-    """Five samples, two inputs and one output; y deviates from r by 0, 1, -2, 0, 1."""
-    u = np.array([[1.0, 0.0], [1.0, 0.05], [3.0, 0.05], [2.5, 0.0], [2.5, 0.0]])
-    y = np.array([[0.0], [1.0], [-2.0], [0.0], [1.0]])
-    return mampc.Run(
-        t=2.0 * np.arange(5), u=u, y=y, y_measured=y + 0.5, r=np.zeros((5, 1)), u_initial=np.zeros(2),
-        decisions=(), dt=2.0, names=mampc.Names(("valve", "pump"), ("level",)), v=np.empty((5, 0)), faults={},
-    )  # fmt: skip
-
-
-def test_metrics_equal_those_worked_out_by_hand():
-    metrics = hand_made_run().metrics(threshold=0.1)  # changes: (1, 0), (0, .05), (2, 0), (-.5, -.05), (0, 0)
-    np.testing.assert_allclose(metrics.sparse_density, [3 / 5, 0.0])
-    np.testing.assert_allclose(metrics.exact_density, [3 / 5, 2 / 5])
-    np.testing.assert_array_equal(metrics.moves, [3, 2])
-    assert metrics.tracking_error == pytest.approx(6 / 5)
-    np.testing.assert_allclose(metrics.travel, [3.5, 0.1])
-    np.testing.assert_array_equal(metrics.reversals, [1, 1])
-    np.testing.assert_allclose(metrics.mean_hold_time, [10 / 4, 10 / 3])
-    assert (metrics.steps, metrics.skipped, metrics.threshold) == (5, 0, 0.1)
-
-
-def test_metrics_without_the_first_samples_equal_those_worked_out_by_hand():
-    metrics = hand_made_run().metrics(threshold=0.0, skip=2)
-    np.testing.assert_allclose(metrics.sparse_density, [2 / 3, 1 / 3])
-    np.testing.assert_allclose(metrics.exact_density, [2 / 3, 1 / 3])
-    assert metrics.tracking_error == pytest.approx(5 / 3)
-    np.testing.assert_allclose(metrics.travel, [2.5, 0.05])
-    np.testing.assert_array_equal(metrics.reversals, [1, 0])
-    assert (metrics.steps, metrics.skipped) == (3, 2)
-
-
-@pytest.mark.parametrize("options", [{"skip": 5}, {"skip": -1}, {"threshold": -0.1}, {"threshold": np.nan}])
-def test_metrics_refuse_settings_out_of_range(options):
-    with pytest.raises(mampc.MampcError, match=r"expected.*received"):
-        hand_made_run().metrics(**options)
-
-
-def test_a_run_is_written_with_all_its_columns_in_full_precision(tmp_path):
-    run = mampc.simulate(TANK, mampc.Regulator(mampc.MPC(tank_problem())), tank_reference(8), noise=0.1)
-    run.to_csv(tmp_path / "run.csv")
-    with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file)
-    assert header == [
-        "time", "u1", "u2", "y1", "y2", "y1_measured", "y2_measured", "y1_reference", "y2_reference",
-        "status", "objective", "iterations", "solve_time_us",
-    ]  # fmt: skip
-    numbers = np.array([row[:9] for row in rows], dtype=float)
-    np.testing.assert_array_equal(numbers, np.column_stack([run.t, run.u, run.y, run.y_measured, run.r]))
-    assert [row[9] for row in rows] == ["optimal"] * 8
-    assert [float(row[10]) for row in rows] == [decision.objective for decision in run.decisions]
-    assert list(tmp_path.iterdir()) == [tmp_path / "run.csv"]
 
 
 # The first case study

@@ -268,11 +268,13 @@ def test_move_limits_that_contradict_the_input_range_still_give_inputs_within_th
     mpc = mampc.MPC(tank_problem(limits=mampc.Limits(u_min=0.0, u_max=100.0, du_max=1.0)))
     model = mpc.problem.model
     decision = mpc.step(mpc.initial_state(u_previous), np.zeros(4), model.y_op)
-    assert decision.status is Status.OPTIMAL
+    assert decision.status is Status.FEASIBLE
     assert (decision.plan >= 0.0).all()
     assert (decision.plan <= 100.0).all()
     inputs = np.vstack([u_previous, decision.plan])
     np.testing.assert_allclose(decision.changes, np.diff(inputs, axis=0), atol=1e-9)
+    expected = cost_of(mpc.problem, np.zeros(4), u_previous, model.y_op, decision.plan)
+    assert decision.objective == pytest.approx(expected, rel=1e-9)
     after = mpc.step(decision.state, np.zeros(4), model.y_op)
     assert after.status is Status.OPTIMAL
     assert (np.abs(after.changes) <= 1.0 + 1e-9).all()

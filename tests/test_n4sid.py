@@ -16,68 +16,10 @@ from nfoursid.nfoursid import NFourSID
 import mampc
 from identification_records import load_record
 from mampc import IOData, MampcError, StateSpace, n4sid, prbs, validate
-from mampc.identification.validation import whiteness
+from random_systems import markov, noise_free, noisy_record, random_system, system_with
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
 SIZES = [(2, 1, 1), (4, 2, 2), (5, 2, 3)]  # states, inputs, outputs
-
-
-def real_form(poles):
-    """A matrix with the given poles; a complex one stands for its conjugate too."""
-    blocks = [[[p.real, p.imag], [-p.imag, p.real]] if p.imag else [[p.real]] for p in map(complex, poles)]
-    size = sum(map(len, blocks))
-    A, at = np.zeros((size, size)), 0
-    for block in blocks:
-        A[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return A
-
-
-def system_with(poles, seed, m=2, l=2, *, feedthrough=True):
-    rng = np.random.default_rng(seed)
-    A = real_form(poles)
-    n = len(A)
-    T = np.eye(n) + 0.3 * rng.standard_normal((n, n))
-    B, C = rng.standard_normal((n, m)), rng.standard_normal((l, n))
-    D = rng.standard_normal((l, m)) if feedthrough else None
-    return StateSpace(T @ A @ np.linalg.inv(T), B, C, D, 1.0, u_op=rng.standard_normal(m))
-
-
-@lru_cache
-def random_system(seed, n, m, l, feedthrough):
-    rng = np.random.default_rng([seed, n])
-    poles = []
-    while n > 0:
-        radius, angle = rng.uniform(0.4, 0.95), rng.uniform(0.3, 2.5)
-        paired = n > 1 and rng.random() < 0.5
-        poles.append(radius * np.exp(1j * angle) if paired else radius * rng.choice([1, 1, -1]))
-        n -= 2 if paired else 1
-    return system_with(poles, seed, m, l, feedthrough=feedthrough)
-
-
-def markov(model, count=20):
-    """D, CB, CAB, ...: the same in all state coordinates."""
-    parameters, column = [model.D], model.B
-    for _ in range(count):
-        parameters.append(model.C @ column)
-        column = model.A @ column
-    return np.array(parameters)
-
-
-def noise_free(system, seed, *, samples=600, at_rest_on_average=True):
-    """A record with a transient from a random initial state.
-
-    The means of a record are an operating point only where its transient sums to none; this is arranged
-    here by correcting the initial state, unless `at_rest_on_average` is False.
-    """
-    rng = np.random.default_rng(seed)
-    u = rng.standard_normal((samples, system.n_inputs))
-    u += system.u_op - u.mean(axis=0)
-    x0 = 3 * rng.standard_normal(system.n_states)
-    if at_rest_on_average:
-        free = sum(system.C @ np.linalg.matrix_power(system.A, k) for k in range(samples))
-        x0 -= np.linalg.pinv(free) @ (system.response(u, x0) - system.y_op).sum(axis=0)
-    return IOData(u, system.response(u, x0), system.dt)
 
 
 def assert_same_dynamics(model, system):
@@ -183,18 +125,6 @@ def test_unseen_plant_data_is_explained_as_well_as_by_octave(name, margin, weigh
     fit = validate(fitted.model, record.validation).fit
     print(f"\n{name}, {weighting}: {fit.round(1)}, Octave {record.fit.round(1)}")
     assert (fit >= record.fit - margin).all()
-
-
-def noisy_record(system, seed, *, samples=1500):
-    """An estimation record at 20 dB signal to noise and a noise-free one to hold out."""
-    rng = np.random.default_rng(seed)
-    n, m = system.n_states, system.n_inputs
-    u = prbs(order=9, hold=3, inputs=m, samples=samples, seed=seed)
-    y = system.response(u, 3 * rng.standard_normal(n))
-    y += 0.1 * y.std(axis=0) * rng.standard_normal(y.shape)
-    unseen = prbs(order=10, hold=3, inputs=m, samples=samples, seed=seed)
-    held_out = IOData(unseen, system.response(unseen, 3 * rng.standard_normal(n)), system.dt)
-    return IOData(u, y, system.dt), held_out
 
 
 def by_slicot(data, order, block_rows):
@@ -406,77 +336,3 @@ def test_the_order_of_the_tank_is_four(seed, weighting):
     fitted = n4sid(tank_record(seed), weighting=weighting)
     assert fitted.order == 4
     assert (fitted.fit > 85).all()
-
-
-def test_a_model_explains_its_own_simulation_from_any_state():
-    system = random_system(2, 5, 2, 3, True)
-    data = noise_free(system, 7, at_rest_on_average=False)
-    result = validate(system, data)
-    np.testing.assert_allclose(result.fit, 100, atol=1e-9)
-    np.testing.assert_allclose(result.y_hat, data.y, atol=1e-10)
-    np.testing.assert_allclose(system.response(data.u, result.x0), data.y, atol=1e-10)
-
-
-def test_the_fit_is_that_of_its_definition():
-    data, _ = noisy_record(random_system(2, 4, 2, 2, True), 0)
-    result = validate(random_system(3, 4, 2, 2, True), data)
-    assert np.array_equal(result.residuals, data.y - result.y_hat)
-    error = np.linalg.norm(result.residuals, axis=0)
-    spread = np.linalg.norm(data.y - data.y.mean(axis=0), axis=0)
-    np.testing.assert_allclose(result.fit, 100 * (1 - error / spread))
-
-
-def test_no_other_initial_state_fits_better():
-    system = random_system(2, 4, 2, 2, True)
-    data = noisy_record(system, 0)[0][:40]
-    result = validate(system, data)
-    least = np.sum(result.residuals**2)
-    for direction in np.eye(4):
-        for step in (-1e-3, 1e-3):
-            assert np.sum((data.y - system.response(data.u, result.x0 + step * direction)) ** 2) > least
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (
-            IOData(np.zeros((9, 2)), np.zeros((9, 2)), 2.0),
-            "expected a record sampled every 1 s, received 2 s",
-        ),
-        (
-            IOData(np.zeros((9, 1)), np.zeros((9, 2)), 1.0),
-            "expected 2 inputs and 2 outputs, received 1 and 2",
-        ),
-        (
-            IOData(np.zeros((9, 2)), np.zeros((9, 3)), 1.0),
-            "expected 2 inputs and 2 outputs, received 2 and 3",
-        ),
-    ],
-)
-def test_a_record_that_does_not_belong_to_the_model_is_refused(data, message):
-    with pytest.raises(MampcError, match=message):
-        validate(random_system(0, 4, 2, 2, True), data)
-
-
-def test_white_residuals_pass_the_whiteness_test_as_often_as_its_level_says():
-    p = whiteness(np.random.default_rng(0).standard_normal((500, 400)))
-    assert 0.02 < np.mean(p < 0.05) < 0.09
-    assert 0.4 < np.median(p) < 0.6
-
-
-def test_coloured_residuals_fail_the_whiteness_test():
-    noise = np.random.default_rng(1).standard_normal((500, 3))
-    moving_average = noise[1:] + 0.7 * noise[:-1]
-    drifting = np.cumsum(noise, axis=0)[1:]
-    assert (whiteness(np.hstack([moving_average, drifting])) < 1e-6).all()
-
-
-def test_residuals_that_vanish_count_as_white():
-    assert np.array_equal(whiteness(np.zeros((50, 2))), [1.0, 1.0])
-
-
-def test_the_residuals_of_the_true_system_are_white_and_those_of_a_wrong_one_are_not():
-    system = random_system(1, 4, 2, 2, True)
-    data = noisy_record(system, 1)[0]
-    assert (validate(system, data).whiteness > 0.01).all()
-    assert (n4sid(data, order=1).validate(data).whiteness < 1e-6).all()

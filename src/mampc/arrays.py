@@ -21,6 +21,17 @@ def is_usable(vector: Array) -> bool:
     return bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
 
 
+def as_shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """Numbers of exactly this shape, finite or not and without a copy where possible; `MampcError` otherwise."""
+    try:
+        array: Array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise MampcError(f"{name}: expected numbers of shape {shape}, received {_short(value)}") from None
+    if array.shape != shape:
+        raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
+    return array
+
+
 def as_array(name: str, value: Any) -> Array:
     """A new, contiguous float64 array; raises `MampcError` for text, ragged lists or complex numbers."""
     try:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.arrays import Array, BoolArray, ComplexArray
+from mampc.arrays import Array, BoolArray, ComplexArray, as_shaped
 from mampc.errors import MampcError
 from mampc.problem import TrackingProblem
 from mampc.qp import UNBOUNDED, QuadraticProgram
@@ -276,11 +276,11 @@ class CondensedQP:
             return np.concatenate((x, u_previous, self._undisturbed, reference))
         d_u, d_y, v, one = self._undisturbed_parts
         if input_disturbance is not None:
-            d_u = _shaped("input_disturbance", input_disturbance, d_u.shape)
+            d_u = as_shaped("input_disturbance", input_disturbance, d_u.shape)
         if output_disturbance is not None:
-            d_y = _shaped("output_disturbance", output_disturbance, d_y.shape)
+            d_y = as_shaped("output_disturbance", output_disturbance, d_y.shape)
         if measured_disturbance is not None:
-            v = _shaped("measured_disturbance", measured_disturbance, v.shape)
+            v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
         return np.concatenate((x, u_previous, d_u, d_y, v, one, reference))
 
     def instance(self, parameter: Array, u_previous: Array) -> Instance:
@@ -332,16 +332,6 @@ class CondensedQP:
         B = model.B[:, :m]
         open_loop = np.block([[model.A, B], [np.zeros((m, n)), np.eye(m)]])
         return np.linalg.eigvals(open_loop + np.vstack([B, np.eye(m)]) @ feedback).astype(complex)
-
-
-def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    try:
-        array: Array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise MampcError(f"{name}: expected numbers of shape {shape}, received {value!r}") from None
-    if array.shape != shape:
-        raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
-    return array
 
 
 def _stacked(**maps: Array) -> tuple[Array, Parts]:

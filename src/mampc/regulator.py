@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array, as_vector, is_usable
+from mampc.arrays import Array, as_shaped, as_vector, is_usable
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.errors import MampcError
@@ -60,6 +60,9 @@ class Regulator:
             y: measurements at that rest, shape (l,); the estimator takes what the model does not
                 explain for a constant disturbance, so that the first step has no jump.
             measured_disturbance: at that rest, shape (d,); default the operating point.
+
+        Raises:
+            MampcError: arrays of the wrong shape, or numbers that are not finite.
         """
         controller = self.controller.initial_state(u_previous)
         v = self.controller.problem.model.v_op
@@ -87,16 +90,16 @@ class Regulator:
                 Left out or not usable, the last one holds on.
 
         Raises:
-            MampcError: arrays of the wrong shape.
+            MampcError: arguments that are no numbers or of the wrong shape.
         """
         start = perf_counter()
-        y = self._shaped("y", y, self._y_shape)
+        y = as_shaped("y", y, self._y_shape)
         memory, v_last = state.controller, state.measured_disturbance
         if u_applied is not None:
             memory = self._applied(memory, u_applied)
         v = v_last
         if measured_disturbance is not None:
-            told = self._shaped("measured_disturbance", measured_disturbance, self._v_shape)
+            told = as_shaped("measured_disturbance", measured_disturbance, self._v_shape)
             v = told if len(told) and is_usable(told) else v_last
         u_previous = memory.inputs[-1]
         estimate = self.estimator.predict(state.estimate, u_previous, v_last)
@@ -119,16 +122,9 @@ class Regulator:
             solve_time=perf_counter() - start,
         )
 
-    @staticmethod
-    def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-        array: Array = np.asarray(value, dtype=np.float64)
-        if array.shape != shape:
-            raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
-        return array
-
     def _applied(self, memory: ControllerState, u_applied: Any) -> ControllerState:
         """The memory with the latest inputs put right; not-usable numbers change nothing."""
-        u = self._shaped("u_applied", u_applied, memory.inputs[-1].shape)
+        u = as_shaped("u_applied", u_applied, memory.inputs[-1].shape)
         if not is_usable(u):
             return memory
         return replace(memory, inputs=np.concatenate([memory.inputs[:-1], u[None]]))

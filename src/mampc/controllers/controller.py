@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.arrays import LARGEST, Array, as_array, as_vector, is_usable
+from mampc.arrays import LARGEST, Array, as_array, as_shaped, as_vector, is_usable
 from mampc.condensing import CondensedQP, Instance
 from mampc.controllers.decision import ControllerState, Decision, Status
 from mampc.errors import MampcError
@@ -60,10 +60,8 @@ class Controller(ABC):
         self._solver = DaqpSolver(self.condensed.program)
         limits, model = problem.limits, problem.model
         # Without limits of their own inputs still stay within what counts as a number.
-        self._u_min, self._u_max = (
-            np.maximum(limits.u_min, -LARGEST / 2),
-            np.minimum(limits.u_max, LARGEST / 2),
-        )
+        self._u_min = np.maximum(limits.u_min, -LARGEST / 2)
+        self._u_max = np.minimum(limits.u_max, LARGEST / 2)
         self._shape = (problem.control_horizon, model.n_inputs)
         self._x_shape = (model.n_states,)
         self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
@@ -118,14 +116,9 @@ class Controller(ABC):
             MampcError: arrays of the wrong shape.
         """
         start = perf_counter()
-        x = np.asarray(x, dtype=np.float64)
-        reference = np.asarray(reference, dtype=np.float64)
-        if x.shape != self._x_shape:
-            raise MampcError(f"x: expected shape {self._x_shape}, received {x.shape}")
-        if reference.shape not in self._reference_shapes:
-            raise MampcError(
-                f"reference: expected shape {self._reference_shapes}, received {reference.shape}"
-            )
+        x = as_shaped("x", x, self._x_shape)
+        constant, previewed = self._reference_shapes
+        reference = as_shaped("reference", reference, constant if np.ndim(reference) == 1 else previewed)
         planned_from = self._planned_from(state)
         while True:
             u_previous = planned_from.inputs[-1]
@@ -181,9 +174,14 @@ class Controller(ABC):
             inputs = np.minimum(np.maximum(inputs, self._u_min), self._u_max)
         else:
             inputs = inputs.reshape(self._shape)
-        if planned_from is not state:  # the way back inside the limits is part of the plan
+        if planned_from is not state:  # the way back inside the limits is part of the plan, and unproven
             changes = changes.copy()
             changes[0] += planned_from.inputs[-1] - state.inputs[-1]
+            weight = self.condensed.R
+            way_back = changes.ravel() @ weight @ changes.ravel() - moves @ weight @ moves
+            objective = float(objective + way_back)
+            lower_bound = -np.inf
+            status = Status.FEASIBLE if status is Status.OPTIMAL else status
         # What is handed out is also what is remembered.
         inputs.setflags(write=False)
         changes.setflags(write=False)

@@ -24,7 +24,10 @@ class Status(StrEnum):
         return member
 
     OPTIMAL = "optimal", "The plan is proven to be the best one."
-    FEASIBLE = "feasible", "The plan keeps every limit and rule; a better one may exist."
+    FEASIBLE = (
+        "feasible",
+        "The plan keeps every limit and rule as far as the past allows; a better one may exist.",
+    )
     SETTLED = "settled", "The method settled; moves off its pattern are small, not zero (see polish)."
     WARM_UP = "warm_up", "Plain MPC, while the sparse method waits for its first past inputs."
     ITERATION_LIMIT = "iteration_limit", "The method stopped at its iteration cap before it settled."

@@ -25,25 +25,17 @@ from mampc.sweep import SETTINGS, Point, holding, sensitivity
 
 SIGNIFICANT = 1.25  # an error above this multiple of plain MPC's is a significant loss; the paper names none
 FIGURES = ("changes", "error")
+SHARED_GRID: dict[str, list[float]] = {
+    "move_weight": [0.01, 0.03, 0.1, 0.3, 1.0],
+    "penalty": [1.0, 3.0, 10.0, 30.0, 100.0],
+    "sparsity_horizon": [1, 3, 5],
+    "max_moves": [1, 3, 5],
+}
 CASES: dict[str, dict[str, list[float]]] = {
-    "quadruple-tank": {
-        "move_weight": [0.01, 0.03, 0.1, 0.3, 1.0],
-        "penalty": [1.0, 3.0, 10.0, 30.0, 100.0],
-        "sparsity_horizon": [1, 3, 5],
-        "max_moves": [1, 3, 5],
-        "dt": [8.0, 10.0, 15.0],
-        "noise": [0.0, 0.05, 0.1, 0.2],
-        "reference": [0.25, 1.0, 4.0],
-    },
-    "sofc": {
-        "move_weight": [0.01, 0.03, 0.1, 0.3, 1.0],
-        "penalty": [1.0, 3.0, 10.0, 30.0, 100.0],
-        "sparsity_horizon": [1, 3, 5],
-        "max_moves": [1, 3, 5],
-        "dt": [0.25, 0.5, 1.0],
-        "noise": [0.0, 0.1, 0.2, 0.4],
-        "reference": [0.25, 1.0, 2.0],
-    },
+    "quadruple-tank": SHARED_GRID
+    | {"dt": [8.0, 10.0, 15.0], "noise": [0.0, 0.05, 0.1, 0.2], "reference": [0.25, 1.0, 4.0]},
+    "sofc": SHARED_GRID
+    | {"dt": [0.25, 0.5, 1.0], "noise": [0.0, 0.1, 0.2, 0.4], "reference": [0.25, 1.0, 2.0]},
 }
 
 

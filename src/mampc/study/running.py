@@ -183,10 +183,7 @@ def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
     if table.method == "mpc":
         return MPC(problem)
     assert table.rules is not None
-    try:
-        method = METHODS[table.method](**table.settings)
-    except (TypeError, MampcError) as error:
-        raise StudyError(f"controllers, {table.name!r}, settings: {error}") from None
+    method = METHODS[table.method](**table.settings)  # checked with the study
     return MAMPC(problem, MoveRules(**table.rules.model_dump()), method=method)
 
 
@@ -211,12 +208,7 @@ def _reference(study: Study, prepared: Prepared) -> Array:
         return staircase
     usual = np.concatenate([prepared.u_op, prepared.v_op])
     if isinstance(plant, StateSpace):
-        return (
-            staircase
-            + plant.y_op
-            + plant.C @ plant.steady_state(usual)
-            + plant.D @ (usual - plant.all_inputs_op)
-        )
+        return staircase + plant.response(usual[None], plant.steady_state(usual))
     return staircase + np.asarray(plant.output(plant.steady_state(usual), usual))
 
 
