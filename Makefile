@@ -47,14 +47,17 @@ clean:  ## remove environments and caches
 .venv/pyvenv.cfg:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "mampc needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
-	command -v uv >/dev/null 2>&1 || test -x $(UV_DIR)/bin/uv \
+	@echo "Setting up .venv, once ..."
+	@command -v uv >/dev/null 2>&1 || test -x $(UV_DIR)/bin/uv \
 	  || { $(PYTHON) -m venv $(UV_DIR) && $(UV_DIR)/bin/python -m pip install --quiet uv; }
-	$(UV) venv --quiet --allow-existing --python $(PYTHON) .venv
+	@$(UV) venv --quiet --allow-existing --python $(PYTHON) .venv
 
 .venv/run.stamp: .venv/pyvenv.cfg pyproject.toml requirements.lock
-	$(UV) pip install --quiet --constraint requirements.lock --editable '.[plot]'
+	@echo "Installing what a run needs ..."
+	@$(UV) pip install --quiet --constraint requirements.lock --editable '.[plot]'
 	@touch $@
 
 .venv/dev.stamp: .venv/pyvenv.cfg pyproject.toml requirements.lock
-	$(UV) pip install --quiet --requirement requirements.lock --editable '.[plot]'
+	@echo "Installing what tests and linters need ..."
+	@$(UV) pip install --quiet --requirement requirements.lock --editable '.[plot]'
 	@touch $@ .venv/run.stamp
