@@ -79,10 +79,10 @@ def test_the_optimum_without_limits_is_at_hand_in_the_instance(seed):
     problem, sample = random_case(seed)
     condensed = CondensedQP(problem)
     instance = sample_data(condensed, **sample)
-    d = instance.unlimited_moves
+    d = instance.moves
     np.testing.assert_allclose(condensed.H @ d + instance.f_moves, 0.0, atol=1e-9 * np.abs(condensed.H).max())
-    np.testing.assert_allclose(instance.unlimited_inputs, planned_inputs(problem, sample, d).ravel())
-    assert instance.unlimited_cost == pytest.approx(condensed.cost(instance, d), rel=1e-9, abs=1e-9)
+    np.testing.assert_allclose(instance.inputs, planned_inputs(problem, sample, d).ravel())
+    assert instance.cost == pytest.approx(condensed.cost(instance, d), rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -91,7 +91,7 @@ def test_margins_are_the_distances_of_that_optimum_to_each_bound(seed):
     problem, sample = random_case(seed, limits=limits)
     condensed = CondensedQP(problem)
     instance = sample_data(condensed, **sample)
-    d = instance.unlimited_moves
+    d = instance.moves
     u = planned_inputs(problem, sample, d)
     y = predicted(
         problem.model, sample["x"], u, problem.prediction_horizon + 1,

@@ -4,7 +4,23 @@ See README.md for ten lines that run, docs/ for the rest.
 """
 
 from mampc import plants
-from mampc.controllers import MAMPC, MPC, Alternating, ControllerState, Decision, Status
+from mampc.controllers import (
+    ADMM,
+    L1,
+    MAMPC,
+    METHODS,
+    MPC,
+    Alternating,
+    ControllerState,
+    Decision,
+    Exact,
+    Greedy,
+    HardThresholding,
+    PenaltyDecomposition,
+    Remark,
+    ReweightedL1,
+    Status,
+)
 from mampc.errors import MampcError, StudyError
 from mampc.estimation import KalmanFilter
 from mampc.identification import Identified, IOData, Validation, excite, n4sid, validate
@@ -20,11 +36,17 @@ from mampc.simulation import Run, simulate
 __version__ = "0.1.0"
 
 __all__ = [
+    "ADMM",
+    "L1",
     "MAMPC",
+    "METHODS",
     "MPC",
     "Alternating",
     "ControllerState",
     "Decision",
+    "Exact",
+    "Greedy",
+    "HardThresholding",
     "IOData",
     "Identified",
     "KalmanFilter",
@@ -33,8 +55,11 @@ __all__ = [
     "Metrics",
     "MoveRules",
     "Names",
+    "PenaltyDecomposition",
     "Regulator",
     "RegulatorState",
+    "Remark",
+    "ReweightedL1",
     "Run",
     "StateSpace",
     "Status",

@@ -16,6 +16,8 @@ Everything that changes from sample to sample (f, the bounds, the error, and the
 limit is active) is affine in the parameter p = (x, u_prev, d_u, d_y, v, 1, r): one matrix-vector product.
 Where outputs are limited, one violation per limited output, scaled as in `TrackingProblem`, stands before
 the moves: z = (violations, d).
+
+On a move pattern S (all other moves zero) the optimum without limits is d_S = -H_SS^-1 f_S: affine as well.
 """
 
 from __future__ import annotations
@@ -33,47 +35,57 @@ LARGEST_RESPONSE = 1e100  # per unit of state or input; its square is still a nu
 
 
 class Parts(NamedTuple):
-    """Where each quantity stands in an instance's data."""
+    """Where each quantity stands in the data of an optimum or an instance."""
 
     margins: slice
     moves: slice
     inputs: slice
     residual: slice
-    f: slice
-    f_moves: slice
-    error: slice
-    lower: slice
-    upper: slice
+    f: slice = slice(0)
+    f_moves: slice = slice(0)
+    error: slice = slice(0)
+    lower: slice = slice(0)
+    upper: slice = slice(0)
 
 
-class Instance:
-    """One sample's data, as views into one array; symbols as in the module's docstring.
+class Optimum:
+    """One sample's optimum without limits on some pattern, as views into one array.
 
-    The first four belong to the optimum without limits: how far it stays from each bound (negative where
-    it breaks one), its moves d, its inputs u_0 .. u_{nc-1}, and a vector whose squared length is its cost.
+    How far it stays from each bound (negative where it breaks one), its moves d, its inputs
+    u_0 .. u_{nc-1}, and a vector whose squared length is its cost.
     """
 
-    __slots__ = ("data", "parts", "u_previous")
+    __slots__ = ("data", "parts")
 
-    def __init__(self, data: Array, parts: Parts, u_previous: Array) -> None:
-        self.data, self.parts, self.u_previous = data, parts, u_previous
+    def __init__(self, data: Array, parts: Parts) -> None:
+        self.data, self.parts = data, parts
 
     @property
     def margins(self) -> Array:
         return self.data[self.parts.margins]
 
     @property
-    def unlimited_moves(self) -> Array:
+    def moves(self) -> Array:
         return self.data[self.parts.moves]
 
     @property
-    def unlimited_inputs(self) -> Array:
+    def inputs(self) -> Array:
         return self.data[self.parts.inputs]
 
     @property
-    def unlimited_cost(self) -> float:
+    def cost(self) -> float:
         residual = self.data[self.parts.residual]
         return float(residual.dot(residual))
+
+
+class Instance(Optimum):
+    """One sample's data; symbols as in the module's docstring. As an `Optimum`: that with every move free."""
+
+    __slots__ = ("parameter", "u_previous")
+
+    def __init__(self, data: Array, parts: Parts, parameter: Array, u_previous: Array) -> None:
+        self.data, self.parts = data, parts
+        self.parameter, self.u_previous = parameter, u_previous
 
     @property
     def f(self) -> Array:
@@ -87,8 +99,14 @@ class Instance:
 
     @property
     def error(self) -> Array:
-        """Q^(1/2) (r - free), shape ((np + 1) l,)."""
+        """Q^(1/2) (r - free), and the weighted tail, shape (n_errors,)."""
         return self.data[self.parts.error]
+
+    @property
+    def constant(self) -> float:
+        """The cost of no moves: |error|^2."""
+        error = self.data[self.parts.error]
+        return float(error.dot(error))
 
     @property
     def lower(self) -> Array:
@@ -99,6 +117,18 @@ class Instance:
     def upper(self) -> Array:
         """Upper bounds of the program, shape (n_bounds,)."""
         return self.data[self.parts.upper]
+
+
+class PatternOptimum:
+    """The optimum without limits on one pattern, ready to be evaluated sample by sample."""
+
+    def __init__(self, preview_map: Array, constant_map: Array, parts: Parts) -> None:
+        self._maps, self.parts = {m.shape[1]: m for m in (preview_map, constant_map)}, parts
+
+    def at(self, instance: Instance) -> Optimum:
+        """Its values for one sample; margins belong to the bounds that `CondensedQP.restricted` keeps."""
+        parameter = instance.parameter
+        return Optimum(self._maps[len(parameter)].dot(parameter), self.parts)
 
 
 class Restriction(NamedTuple):
@@ -117,25 +147,35 @@ class CondensedQP:
         H: its block for the moves, shape (n_moves, n_moves).
         theta: predicted outputs per move, shape ((np + 1) l, n_moves).
         cumulate: u_j - u_prev per move, shape (n_moves, n_moves).
+        weighted_theta: Q^(1/2) theta, and below it the weighted tail's rows, shape (n_errors, n_moves).
+        map_bytes: about the memory that an `optimum_on` some pattern takes.
         violation_scale: sqrt(q) of `TrackingProblem`, per output, shape (l,).
+
+    Args:
+        problem: what to condense.
+        bound_every_move: give every move a simple bound, though du_max may be infinite.
 
     Raises:
         MampcError: the moves are not all determined by the weights (H is singular), or an unstable
             model's predictions overflow.
     """
 
-    def __init__(self, problem: TrackingProblem) -> None:
+    def __init__(self, problem: TrackingProblem, *, bound_every_move: bool = False) -> None:
         self.problem = problem
+        # With move limits every move has a simple bound and every input a row; without, the first inputs'
+        # limits are simple bounds of the first moves.
+        self._moves_bounded = bound_every_move or bool(np.isfinite(problem.limits.du_max).any())
         model, n_p, n_c = problem.model, problem.prediction_horizon, problem.control_horizon
         m, l = model.n_inputs, model.n_outputs
         self.n_moves = n_c * m
         self.cumulate = np.kron(np.tri(n_c), np.eye(m))
 
-        observed = [model.C]  # C A^i
+        powers = [np.eye(model.n_states)]  # A^i
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(n_p):
-                observed.append(observed[-1] @ model.A)
-            step = np.cumsum([model.D] + [rows @ model.B for rows in observed[:-1]], axis=0)  # S_i
+                powers.append(powers[-1] @ model.A)
+            observed = model.C @ np.array(powers)  # C A^i
+            step = np.cumsum([model.D, *(observed[:-1] @ model.B)], axis=0)  # S_i
         if not (np.abs(observed) < LARGEST_RESPONSE).all() or not (np.abs(step) < LARGEST_RESPONSE).all():
             raise MampcError(
                 f"CondensedQP: expected predictions that stay within numbers over {n_p} samples, received a "
@@ -150,9 +190,6 @@ class CondensedQP:
         self.R = np.kron(np.eye(n_c), problem.move_weight)
         if not problem.weigh_first_move:
             self.R[:m, :m] = 0.0
-        H = 2 * (self.weighted_theta.T @ self.weighted_theta + self.R)
-        self.H = (H + H.T) / 2
-
         # Affine maps of p = (x, u_prev, d_u, d_y, v, 1, r), for a previewed reference.
         responses = step.reshape(-1, model.B.shape[1])
         inputs, measured = responses[:, :m], responses[:, m:]
@@ -166,25 +203,25 @@ class CondensedQP:
         u_previous = np.zeros((m, free.shape[1]))
         u_previous[:, model.n_states : model.n_states + m] = np.eye(m)
 
-        lower, upper = self._build_program(free, u_previous)
         error = root @ error
+        if problem.tail_horizon > 0:
+            tail_error, tail_theta = self._tail(np.array(powers), free.shape[1])
+            error, self.weighted_theta = (
+                np.vstack([error, tail_error]), np.vstack([self.weighted_theta, tail_theta]),
+            )  # fmt: skip
+        H = 2 * (self.weighted_theta.T @ self.weighted_theta + self.R)
+        self.H = (H + H.T) / 2
+        lower, upper = self._build_program(free, u_previous)
         f = np.zeros((self.program.n_variables, free.shape[1]))
         f[: self.n_violations, self._one_at] = problem.output_limit_weight
         f[self.n_violations :] = -2 * self.weighted_theta.T @ error
-        moves = -np.linalg.solve(self.H, f[self.n_violations :])
-        at_optimum = self.bounded_rows @ moves
-        v = self.n_violations
+        self._affine = {"error": error, "f": f, "lower": lower, "upper": upper}
+        self._u_previous_map, self._root_R = u_previous, _square_root(self.R)
         self._preview_map, self.parts = _stacked(
-            margins=np.concatenate([at_optimum - lower[v:], upper[v:] - at_optimum]),
-            moves=moves,
-            inputs=np.tile(u_previous, (n_c, 1)) + self.cumulate @ moves,
-            residual=np.concatenate([error - self.weighted_theta @ moves, _square_root(self.R) @ moves]),
-            f=f,
-            f_moves=f[v:],
-            error=error,
-            lower=lower,
-            upper=upper,
-        )
+            **self._optimum_maps(np.ones(self.n_moves, dtype=bool)), f=f, f_moves=f[self.n_violations :],
+            error=error, lower=lower, upper=upper,
+        )  # fmt: skip
+        self.map_bytes = self._preview_map.nbytes
         self._constant_map = self._with_constant_reference(self._preview_map)
         parts: tuple[Array, Array, Array, Array] = np.zeros(m), np.zeros(l), model.v_op, np.ones(1)
         self._undisturbed_parts, self._undisturbed = parts, np.concatenate(parts)  # (d_u, d_y, v, 1)
@@ -198,11 +235,8 @@ class CondensedQP:
         m, l, n_c, n = problem.model.n_inputs, problem.model.n_outputs, problem.control_horizon, self.n_moves
         limited = np.isfinite(limits.y_min) | np.isfinite(limits.y_max)
         self.n_violations = v = int(limited.sum())
-        # With move limits every move has a simple bound and every input a row; without, the first inputs'
-        # limits are simple bounds of the first moves.
-        moves_limited = bool(np.isfinite(limits.du_max).any())
-        n_simple = v + (n if moves_limited else m)
-        skipped = 0 if moves_limited else m
+        n_simple = v + (n if self._moves_bounded else m)
+        skipped = 0 if self._moves_bounded else m
         inputs = np.flatnonzero(np.tile(np.isfinite(limits.u_min) | np.isfinite(limits.u_max), n_c))
         inputs = inputs[inputs >= skipped]
         # theta d - e <= y_max - free and theta d + e >= y_min - free at i = 1..np, e that output's violation.
@@ -237,7 +271,7 @@ class CondensedQP:
         upper = -lower
         lower[:v, one] = 0.0
         u_min, u_max = np.maximum(limits.u_min, -UNBOUNDED), np.minimum(limits.u_max, UNBOUNDED)
-        if moves_limited:
+        if self._moves_bounded:
             upper[v:n_simple, one] = np.tile(np.minimum(limits.du_max, UNBOUNDED), n_c)
             lower[v:n_simple, one] = -upper[v:n_simple, one]
         else:
@@ -251,6 +285,81 @@ class CondensedQP:
         lower[self._below_rows] = -free[self._below]
         lower[self._below_rows, one] += limits.y_min[self._below % l]
         return lower, upper
+
+    def _tail(self, powers: Array, n_parameters: int) -> tuple[Array, Array]:
+        """Rows of error and weighted_theta for the tail of the horizon, as `TrackingProblem` defines it.
+
+        From sample np on the inputs stay, so zeta = (x_np, b, a) evolves by itself, with b = B u constant
+        and the error a - C x: the sum of its weighted squares is zeta' P zeta, P from a Lyapunov equation.
+        """
+        problem, model = self.problem, self.problem.model
+        n, m, l, n_c = model.n_states, model.n_inputs, model.n_outputs, problem.control_horizon
+        gamma = problem.tail_horizon / (1 + problem.tail_horizon)
+        radius = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0)
+        if not gamma * radius**2 < 1:
+            raise MampcError(
+                f"tail_horizon: expected below {1 / max(radius**2 - 1, 1e-16):.3g} samples for a model with a pole "
+                f"of size {radius:.4g}, received {problem.tail_horizon:g}; without inputs that move its errors grow"
+            )
+        eye, zero = np.eye(n), np.zeros((n, l))
+        F = np.block([[model.A, eye, zero], [0 * eye, eye, zero], [zero.T, zero.T, np.eye(l)]])
+        E = np.hstack([-model.C, zero.T, np.eye(l)])
+        F *= np.sqrt(gamma)
+        P = F.T @ E.T @ problem.output_weight @ E @ F
+        while F.any() and np.abs(F).max() > 1e-150:  # doubling: P_2k = P_k + F^k' P_k F^k
+            grown = P + F.T @ P @ F
+            if np.allclose(grown, P, rtol=1e-15, atol=0.0):
+                break
+            P, F = grown, F @ F
+
+        forced = np.concatenate(
+            [np.zeros((1, n, model.B.shape[1])), np.cumsum(powers[:-1] @ model.B, axis=0)]
+        )
+        columns = np.split(np.arange(n_parameters), np.cumsum([n, m, m, l, model.B.shape[1] - m, 1]))
+        x, u_previous, d_u, d_y, v, one, r = columns
+        zeta = np.zeros((2 * n + l, n_parameters))
+        for row, matrix in zip(
+            (slice(n), slice(n, 2 * n), slice(2 * n, None)), (forced[-1], model.B, -model.D), strict=True
+        ):
+            zeta[row, u_previous] = zeta[row, d_u] = matrix[:, :m]
+            zeta[row, v] = matrix[:, m:]
+            zeta[row, one] = -(matrix @ model.all_inputs_op)[:, None]
+        zeta[:n, x] = powers[-1]
+        zeta[2 * n :, one] -= model.y_op[:, None]
+        zeta[2 * n :, d_y], zeta[2 * n :, r[-l:]] = -np.eye(l), np.eye(l)
+        of_moves = np.vstack(
+            [
+                np.hstack([forced[problem.prediction_horizon - j][:, :m] for j in range(n_c)]),
+                np.tile(model.B[:, :m], n_c),
+                np.tile(-model.D[:, :m], n_c),
+            ]
+        )
+        root = _square_root(P)
+        return root @ zeta, -root @ of_moves
+
+    def _optimum_maps(self, pattern: BoolArray) -> dict[str, Array]:
+        """The optimum without limits on a pattern: its margins, moves, inputs and residual as maps of p."""
+        v, affine = self.n_violations, self._affine
+        bounds = (
+            self.restricted(pattern).bounds[v:] if not pattern.all() else np.arange(v, self.program.n_bounds)
+        )
+        moves = np.zeros((self.n_moves, affine["f"].shape[1]))
+        moves[pattern] = -np.linalg.solve(self.H[np.ix_(pattern, pattern)], affine["f"][v:][pattern])
+        at_optimum = self.bounded_rows[bounds - v] @ moves
+        return {
+            "margins": np.concatenate(
+                [at_optimum - affine["lower"][bounds], affine["upper"][bounds] - at_optimum]
+            ),
+            "moves": moves,
+            "inputs": np.tile(self._u_previous_map, (self.problem.control_horizon, 1))
+            + self.cumulate @ moves,
+            "residual": np.concatenate([affine["error"] - self.weighted_theta @ moves, self._root_R @ moves]),
+        }
+
+    def optimum_on(self, pattern: BoolArray) -> PatternOptimum:
+        """The optimum without limits where only the moves of `pattern`, shape (n_moves,), may differ from zero."""
+        preview_map, parts = _stacked(**self._optimum_maps(pattern))
+        return PatternOptimum(preview_map, self._with_constant_reference(preview_map), parts)
 
     def _with_constant_reference(self, preview_map: Array) -> Array:
         """The map for one reference (l,) that holds over the horizon."""
@@ -286,7 +395,7 @@ class CondensedQP:
     def instance(self, parameter: Array, u_previous: Array) -> Instance:
         """The data of one sample, from its `parameter`."""
         maps = self._constant_map if len(parameter) == self._constant_map.shape[1] else self._preview_map
-        return Instance(maps.dot(parameter), self.parts, u_previous)
+        return Instance(maps.dot(parameter), self.parts, parameter, u_previous)
 
     def cost(self, instance: Instance, moves: Array) -> float:
         """Tracking cost plus move weights plus output-limit penalty of the moves d, shape (n_moves,)."""
@@ -306,6 +415,25 @@ class CondensedQP:
         np.maximum.at(excess, self._above % l, above)
         np.maximum.at(excess, self._below % l, below)
         return excess
+
+    def relaxed_limits(self, instance: Instance, multipliers: Array) -> tuple[Array, float]:
+        """The program with its limits priced by multipliers instead of kept (Lagrangian relaxation).
+
+        Args:
+            multipliers: of the bounds, shape (n_bounds,), positive at upper bounds.
+
+        Returns:
+            Linear term g, shape (n_moves,), and constant c: no moves that keep the limits cost less than
+            c + min 1/2 d' H d + g' d, on any pattern.
+        """
+        v, n_simple = self.n_violations, self.program.n_simple
+        active = np.flatnonzero(multipliers)
+        pull = multipliers[active]
+        bound = np.where(pull > 0, instance.upper[active], instance.lower[active])
+        g = instance.f + multipliers[n_simple:] @ self.program.A
+        g[:n_simple] += multipliers[:n_simple]
+        constant = instance.constant - pull @ bound - 0.5 * (g[:v] @ g[:v]) / self.problem.output_limit_weight
+        return g[v:], float(constant)
 
     def restricted(self, pattern: BoolArray) -> Restriction:
         """The program on the moves where `pattern`, shape (n_moves,), is true; the others are zero.

@@ -55,7 +55,7 @@ class Limits:
 class TrackingProblem:
     """Track references with a linear model over a receding horizon (the paper's eqs. 1 to 3).
 
-        minimise   sum_{i=0..np} |r_i - y_i|^2_Q + sum_{j=0..nc-1} |du_j|^2_R + penalty(y limits)
+        minimise   sum_{i=0..np} |r_i - y_i|^2_Q + sum_{j=0..nc-1} |du_j|^2_R + penalty(y limits) [+ tail]
         subject to u_min <= u_j <= u_max, |du_j| <= du_max     j = 0..nc-1
                    y_min - e <= y_i <= y_max + e               i = 1..np
 
@@ -73,6 +73,9 @@ class TrackingProblem:
         limits: input, move and output limits, in engineering units.
         weigh_first_move: False leaves du_0 without weight, as the paper prints it (sum from j = 1).
         output_limit_weight: w, up to 1e8: how many times tracking a violation counts.
+        tail_horizon: L >= 0, in samples. Beyond the prediction horizon, inputs held, errors go on to count,
+            weighted gamma, gamma^2, ... with gamma = L / (1 + L), so that an error that stays costs L
+            samples more. With prices it decides how long an offset is looked at (see docs/methods.md).
 
     Raises:
         MampcError: anything that does not fit the model or the horizons.
@@ -86,6 +89,7 @@ class TrackingProblem:
     limits: Limits = field(default=Limits(), kw_only=True)
     weigh_first_move: bool = field(default=True, kw_only=True)
     output_limit_weight: float = field(default=1e4, kw_only=True)
+    tail_horizon: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, StateSpace):
@@ -116,6 +120,7 @@ class TrackingProblem:
             "move_weight": as_weight("move_weight", self.move_weight, m),
             "limits": self.limits.checked(m, l),
             "output_limit_weight": weight,
+            "tail_horizon": as_number("tail_horizon", self.tail_horizon, 0.0),
         }.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False

@@ -9,10 +9,14 @@ at most s entries, mu the penalty that ties them:
 until |u_{i+1} - u_i|_1 <= eps1. Past entries are fixed and compete in the second step. At a fixed point
 v = d on the pattern and v = 0 off it, so d is the MPC solution with move weight lambda on the pattern and
 lambda + mu off it: moves off the pattern shrink and never vanish. `polish` makes them vanish.
+
+Where other rules than a budget hold, the second step is the same minimisation under them: v is zero off the
+admissible pattern of largest mu |d|^2 less price.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,42 +26,37 @@ from mampc.arrays import Array, BoolArray, as_number, as_whole
 from mampc.condensing import CondensedQP, Instance
 from mampc.controllers.controller import HELD_BY, Plan
 from mampc.controllers.decision import ControllerState, Status
-from mampc.controllers.pattern_solver import PatternSolver
-from mampc.errors import MampcError
-from mampc.patterns import MoveRules
-from mampc.qp import QPSolution, QPStatus, QuadraticProgram
+from mampc.controllers.heuristic import Heuristic, HeuristicSearch
+from mampc.controllers.pattern_solver import Incumbent
+from mampc.patterns import MoveRules, Past
+from mampc.qp import QPStatus, QuadraticProgram
 from mampc.qp_daqp import DaqpSolver
-
-HIGHEST_PENALTY = 1e10  # a growing mu stops here: beyond it the first step loses its digits
 
 
 @dataclass(frozen=True, kw_only=True)
-class Alternating:
+class Alternating(Heuristic):
     """Settings of the alternating minimisation.
 
     Args:
         penalty: mu > 0, cost per squared move off the pattern.
         tolerance: eps1 > 0; stop when the plan changes by no more, sum of |u| in engineering units.
         max_iterations: rounds of both steps at most.
-        polish: solve once more on the chosen pattern, with all other moves exactly zero and the budget
-            left after the past moves strictly kept.
-        penalty_growth: >= 1; when above 1, mu is multiplied by it each time the rounds have settled,
-            until no move off the pattern exceeds the tolerance.
+        polish: solve once more on the chosen pattern, with all other moves exactly zero and the rules
+            strictly kept.
         warm_up: samples of plain MPC at the start; default the sparsity horizon.
+        certify: see `Heuristic`; the bound is that of exactly sparse plans, which `polish` gives.
     """
 
     penalty: float = 10.0
     tolerance: float = 1e-4
     max_iterations: int = 500
     polish: bool = False
-    penalty_growth: float = 1.0
     warm_up: int | None = None
 
     def __post_init__(self) -> None:
         as_number("penalty", self.penalty, 0.0, exclusive=True)
         as_number("tolerance", self.tolerance, 0.0, exclusive=True)
         as_whole("max_iterations", self.max_iterations, 1)
-        as_number("penalty_growth", self.penalty_growth, 1.0)
         if self.warm_up is not None:
             as_whole("warm_up", self.warm_up, 0)
 
@@ -66,75 +65,88 @@ class Alternating:
         return AlternatingSearch(self, condensed, rules)
 
 
-class AlternatingSearch:
+class AlternatingSearch(HeuristicSearch):
     """The alternating minimisation, prepared for one condensed problem."""
 
     def __init__(self, settings: Alternating, condensed: CondensedQP, rules: MoveRules) -> None:
-        if rules.max_moves is None:
-            raise MampcError("Alternating: expected MoveRules with max_moves, received none")
-        self.settings, self.condensed, self.rules = settings, condensed, rules
+        super().__init__(settings, condensed, rules)
+        self.settings = settings
         self.warm_up = rules.sparsity_horizon if settings.warm_up is None else settings.warm_up
-        m = condensed.problem.model.n_inputs
-        self._threshold = HardThreshold(rules.max_moves, rules.sparsity_horizon, m, condensed.n_moves)
-        self._first_steps: dict[float, FirstStep] = {}
-        self._first_step(settings.penalty)
-        self._polisher = PatternSolver(condensed)
+        self._first_step = FirstStep(condensed, settings.penalty)
+        self._threshold = None
+        if self.admissible.simple and rules.max_moves is not None and not self.admissible.priced:
+            m = self.admissible.n_inputs
+            self._threshold = HardThreshold(rules.max_moves, rules.sparsity_horizon, m, condensed.n_moves)
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """Algorithm 1 for one sample, from the guess that the last sample left (at first: v = 0)."""
-        settings, growth = self.settings, self.settings.penalty_growth
-        threshold = self._threshold
-        magnitude = threshold.magnitude(self.rules.past_changes(state.inputs))
-        v: Array = np.zeros(self.condensed.n_moves) if state.guess is None else state.guess.ravel()
-        first_step = self._first_step(settings.penalty)
-        sample = first_step.begin(instance)
-        u_last, settled, rounds = None, False, 0
-        while rounds < settings.max_iterations:
-            d, u, solved = first_step.minimise(sample, v)
-            if solved is not QPStatus.OPTIMAL:
-                return Plan(None, HELD_BY[solved], rounds)
-            pattern = threshold.pattern(magnitude, d)
-            v = d * pattern
-            rounds += 1
-            if u_last is not None and np.abs(u - u_last).sum() <= settings.tolerance:
-                if (
-                    growth == 1.0
-                    or np.abs(d - v).max() <= settings.tolerance
-                    or first_step.mu >= HIGHEST_PENALTY
-                ):
-                    settled = True
-                    break
-                first_step = self._first_step(min(first_step.mu * growth, HIGHEST_PENALTY))
-                sample = first_step.begin(instance)
-            u_last = u
-        m = len(instance.u_previous)
-        guess = np.concatenate([v[m:], np.zeros(m)]).reshape(-1, m)
-        if settings.polish:
-            polished = self._polished(instance, state, d, pattern)
-            if polished.z is None:
-                return Plan(None, HELD_BY[polished.status], rounds)
-            d = polished.z
-        status = (
-            Status.ITERATION_LIMIT if not settled else Status.FEASIBLE if settings.polish else Status.SETTLED
+        past = self.admissible.past(state.inputs)
+        v = np.zeros(self.condensed.n_moves) if state.guess is None else state.guess.ravel()
+        choose = self._second_step(state, past)
+        settled = alternate(
+            self._first_step, instance, v, choose, self.settings.tolerance, self.settings.max_iterations
         )
-        return Plan(d, status, rounds, guess=guess)
+        if settled.status is QPStatus.ITERATION_LIMIT:
+            status = Status.ITERATION_LIMIT
+        elif settled.status is not QPStatus.OPTIMAL:
+            return Plan(None, HELD_BY[settled.status], settled.rounds)
+        else:
+            status = Status.FEASIBLE if self.settings.polish else Status.SETTLED
+        guess = self._shifted(settled.v)
+        if not self.settings.polish:
+            plan = Plan(settled.d, status, settled.rounds, guess=guess, remarks=self._remarks(past))
+            return self._certified(plan, instance, state)
+        pattern = settled.v != 0.0
+        if not self.admissible.allows(pattern, past):  # past moves compete above; here they are gone for good
+            pattern = self.admissible.select(
+                np.where(pattern, np.abs(settled.d) + self.admissible.price.max(), 0.0), past
+            )
+        best = Incumbent()
+        self._solver.offer(instance, pattern, best)
+        return self._certified(
+            self._best(instance, best, past, settled.rounds, guess, status), instance, state
+        )
 
-    def _polished(
-        self, instance: Instance, state: ControllerState, d: Array, pattern: BoolArray
-    ) -> QPSolution:
-        """The best moves on the pattern, cut to the budget that the applied moves leave."""
-        left = self.rules.moves_left(state.inputs, len(d))
-        if np.count_nonzero(pattern) > left:
-            on_pattern = np.where(pattern, np.abs(d), -1.0)
-            pattern = np.zeros(len(d), dtype=bool)
-            pattern[np.argsort(-on_pattern, kind="stable")[:left]] = True
-        return self._polisher.solve(instance, pattern)
+    def _second_step(self, state: ControllerState, past: Past) -> Callable[[Array], BoolArray]:
+        """What picks the pattern: the paper's threshold for a budget, its extension for other rules."""
+        threshold, mu = self._threshold, self.settings.penalty
+        if threshold is None:
+            return lambda d: self.admissible.select(mu * d * d, past)
+        magnitude = threshold.magnitude(self.rules.past_changes(state.inputs))
+        return lambda d: threshold.pattern(magnitude, d)
 
-    def _first_step(self, mu: float) -> FirstStep:
-        step = self._first_steps.get(mu)
-        if step is None:
-            step = self._first_steps[mu] = FirstStep(self.condensed, mu)
-        return step
+
+class Settled(NamedTuple):
+    """How an alternation ended: moves d, their copy v on the pattern, rounds.
+
+    The status is ITERATION_LIMIT where it had to stop, and the solver's where the first step failed.
+    """
+
+    d: Array
+    v: Array
+    rounds: int
+    status: QPStatus
+
+
+def alternate(
+    first_step: FirstStep,
+    instance: Instance,
+    v: Array,
+    choose: Callable[[Array], BoolArray],
+    tolerance: float,
+    most: int,
+) -> Settled:
+    """Both steps by turns from v, until the planned inputs change by no more than the tolerance in sum."""
+    sample, u_last, d = first_step.begin(instance), None, v
+    for rounds in range(1, most + 1):
+        d, u, solved = first_step.minimise(sample, v)
+        if solved is not QPStatus.OPTIMAL:
+            return Settled(d, v, rounds, solved)
+        v = d * choose(d)
+        if u_last is not None and np.abs(u - u_last).sum() <= tolerance:
+            return Settled(d, v, rounds, QPStatus.OPTIMAL)
+        u_last = u
+    return Settled(d, v, most, QPStatus.ITERATION_LIMIT)
 
 
 class Sample(NamedTuple):

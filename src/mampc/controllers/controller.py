@@ -11,7 +11,7 @@ import numpy as np
 
 from mampc.arrays import LARGEST, Array, as_array, as_shaped, as_vector, is_usable
 from mampc.condensing import CondensedQP, Instance
-from mampc.controllers.decision import ControllerState, Decision, Status
+from mampc.controllers.decision import ControllerState, Decision, Remark, Status
 from mampc.errors import MampcError
 from mampc.problem import TrackingProblem
 from mampc.qp import QPStatus
@@ -43,6 +43,7 @@ class Plan(NamedTuple):
     guess: Array | None = None
     inputs: Array | None = None
     objective: float | None = None
+    remarks: tuple[Remark, ...] = ()
 
 
 class Controller(ABC):
@@ -52,16 +53,17 @@ class Controller(ABC):
         problem: what to track, over which horizons, at what weights and within what limits.
     """
 
-    def __init__(self, problem: TrackingProblem) -> None:
+    def __init__(self, problem: TrackingProblem, *, bound_every_move: bool = False) -> None:
         if not isinstance(problem, TrackingProblem):
             raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
         self.problem = problem
-        self.condensed = CondensedQP(problem)
+        self.condensed = CondensedQP(problem, bound_every_move=bound_every_move)
         self._solver = DaqpSolver(self.condensed.program)
         limits, model = problem.limits, problem.model
         # Without limits of their own inputs still stay within what counts as a number.
         self._u_min = np.maximum(limits.u_min, -LARGEST / 2)
         self._u_max = np.minimum(limits.u_max, LARGEST / 2)
+        self._u_range = list(zip(self._u_min.tolist(), self._u_max.tolist(), strict=True))
         self._shape = (problem.control_horizon, model.n_inputs)
         self._x_shape = (model.n_states,)
         self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
@@ -148,6 +150,10 @@ class Controller(ABC):
         kept = state.inputs[1:] if len(state.inputs) > 1 else state.inputs[:0]
         return replace(state, inputs=np.concatenate([kept, inside]))
 
+    def _price(self, moves: Array) -> float:
+        """What the moves, shape (n_moves,), cost beside the tracking problem's own objective."""
+        return 0.0
+
     @abstractmethod
     def _plan(self, instance: Instance, state: ControllerState) -> Plan:
         """Search the moves for one sample's data."""
@@ -160,17 +166,18 @@ class Controller(ABC):
         planned_from: ControllerState,
         start: float,
     ) -> Decision:
-        moves, status, iterations, lower_bound, guess, inputs, objective = plan
+        moves, status, iterations, lower_bound, guess, inputs, objective, remarks = plan
         if moves is None or instance is None:
             moves = np.zeros(self.condensed.n_moves)
             objective, lower_bound = np.nan, -np.inf
         elif objective is None:
-            objective = self.condensed.cost(instance, moves)
+            objective = self.condensed.cost(instance, moves) + self._price(moves)
         if lower_bound is None:
             lower_bound = objective
         changes = moves.reshape(self._shape)
         if inputs is None:
-            inputs = (self.condensed.cumulate @ moves).reshape(self._shape) + planned_from.inputs[-1]
+            # Sums in this order leave an input that does not move exactly where it was.
+            inputs = np.concatenate((planned_from.inputs[-1:], changes)).cumsum(axis=0)[1:]
             inputs = np.minimum(np.maximum(inputs, self._u_min), self._u_max)
         else:
             inputs = inputs.reshape(self._shape)
@@ -179,8 +186,9 @@ class Controller(ABC):
             changes[0] += planned_from.inputs[-1] - state.inputs[-1]
             weight = self.condensed.R
             way_back = changes.ravel() @ weight @ changes.ravel() - moves @ weight @ moves
-            objective = float(objective + way_back)
+            objective = float(objective + way_back + self._price(changes.ravel()) - self._price(moves))
             lower_bound = -np.inf
+            remarks = (*remarks, Remark.BACK_INSIDE)
             status = Status.FEASIBLE if status is Status.OPTIMAL else status
         # What is handed out is also what is remembered.
         inputs.setflags(write=False)
@@ -189,7 +197,7 @@ class Controller(ABC):
         history = inputs[:1] if len(history) == 1 else np.concatenate((history[1:], inputs[:1]))
         return Decision(
             u, inputs, changes, status, objective, lower_bound, iterations,
-            perf_counter() - start, ControllerState(history, state.samples + 1, guess),
+            perf_counter() - start, ControllerState(history, state.samples + 1, guess), remarks,
         )  # fmt: skip
 
     def _unrestricted(self, instance: Instance) -> Plan:
@@ -197,8 +205,8 @@ class Controller(ABC):
         margins = instance.margins
         if margins[margins.argmin()] > INSIDE:
             return Plan(
-                instance.unlimited_moves, Status.OPTIMAL, 0, None, None,
-                instance.unlimited_inputs, instance.unlimited_cost,
+                instance.moves, Status.OPTIMAL, 0, None, None,
+                instance.inputs, instance.cost,
             )  # fmt: skip
         solution = self._solver.solve(instance.f, instance.lower, instance.upper)
         if solution.z is None:

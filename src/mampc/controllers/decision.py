@@ -40,6 +40,24 @@ class Status(StrEnum):
     HELD_SOLVER_FAILED = "held_solver_failed", "The solver failed: the previous inputs are held."
 
 
+class Remark(StrEnum):
+    """What else there is to say about a decision; `remark.sentence` says it in words."""
+
+    sentence: str
+
+    def __new__(cls, value: str, sentence: str) -> Remark:
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.sentence = sentence
+        return member
+
+    BUDGET_EXCEEDED = (
+        "budget_exceeded",
+        "The moves already made exceed the budget of their window: no further move is planned.",
+    )
+    BACK_INSIDE = "back_inside", "The applied inputs were outside their limits and go back inside."
+
+
 @dataclass(frozen=True, eq=False)
 class ControllerState:
     """What a controller remembers: plain numbers, safe to copy and pickle.
@@ -65,11 +83,12 @@ class Decision:
         changes: planned moves du, shape (nc, m); with an exact pattern (polish) zero off it.
         status: how the decision came about.
         objective: cost of the plan: tracking over i = 0..np, move weights over j = 0..nc-1, output-limit
-            penalty; not-a-number where nothing was solved.
+            penalty, price of the planned moves; not-a-number where nothing was solved.
         lower_bound: no admissible plan costs less; minus infinity where nothing is proven.
         iterations: solver iterations (MPC) or rounds of the method.
         solve_time: seconds from call to answer.
         state: the controller's state for the next sample.
+        remarks: anything else worth knowing.
     """
 
     u: Array
@@ -81,6 +100,7 @@ class Decision:
     iterations: int
     solve_time: float
     state: Any
+    remarks: tuple[Remark, ...] = ()
 
     @property
     def gap(self) -> float:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Protocol
 
 import numpy as np
 
+from mampc.arrays import Array
 from mampc.condensing import CondensedQP, Instance
+from mampc.controllers.admm import ADMM
 from mampc.controllers.alternating import Alternating
 from mampc.controllers.controller import Controller, Plan
 from mampc.controllers.decision import ControllerState, Status
+from mampc.controllers.exact import Exact
+from mampc.controllers.greedy import Greedy
+from mampc.controllers.hard_thresholding import HardThresholding
+from mampc.controllers.l1 import L1, ReweightedL1
+from mampc.controllers.penalty_decomposition import PenaltyDecomposition
 from mampc.errors import MampcError
 from mampc.patterns import MoveRules
 from mampc.problem import TrackingProblem
@@ -29,7 +38,16 @@ class Method(Protocol):
     def prepare(self, condensed: CondensedQP, rules: MoveRules) -> Search: ...
 
 
-METHODS: dict[str, type[Alternating]] = {"alternating": Alternating}
+METHODS: dict[str, type] = {
+    "exact": Exact,
+    "alternating": Alternating,
+    "greedy": Greedy,
+    "penalty_decomposition": PenaltyDecomposition,
+    "hard_thresholding": HardThresholding,
+    "admm": ADMM,
+    "l1": L1,
+    "reweighted_l1": ReweightedL1,
+}
 
 
 class MAMPC(Controller):
@@ -37,46 +55,78 @@ class MAMPC(Controller):
 
     Args:
         problem: what to track (see `TrackingProblem`).
-        rules: which move patterns are admissible (see `MoveRules`).
-        method: "alternating" (the paper's), or a method object with settings such as
-            `mampc.Alternating(penalty=10.0, polish=True)`.
+        rules: what moves cost and which patterns of moves are admissible (see `MoveRules`).
+        method: "exact" (the default: proven best), "alternating" (the paper's), or another name of
+            `mampc.METHODS`; or a method object with settings such as `mampc.Alternating(penalty=10.0)`.
+        settings: of a method given by name, such as `penalty=10.0`.
 
     Raises:
-        MampcError: an unknown method, or rules that the method cannot keep.
+        MampcError: an unknown method or setting, or rules that do not fit the problem.
     """
 
     def __init__(
-        self, problem: TrackingProblem, rules: MoveRules, *, method: str | Method = "alternating"
+        self, problem: TrackingProblem, rules: MoveRules, *, method: str | Method = "exact", **settings: Any
     ) -> None:
-        super().__init__(problem)
         if not isinstance(rules, MoveRules):
             raise MampcError(f"rules: expected mampc.MoveRules, received {type(rules).__name__}")
+        super().__init__(problem, bound_every_move=bool(np.any(rules.min_size)))
         self.rules = rules
-        self.method = _method(method)
-        self._search = self.method.prepare(self.condensed, rules)
+        self.method = method_of(method, settings)
+        self._admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
+        self._check_sizes()
+        # Without any rule this is plain MPC.
+        self._search = None if self._admissible.unrestricted else self.method.prepare(self.condensed, rules)
+
+    def _check_sizes(self) -> None:
+        """A least size beyond what an input can move means that it never does."""
+        limits, size = self.problem.limits, self._admissible.min_size[: self.problem.model.n_inputs]
+        for name, most in (("du_max", limits.du_max), ("u_max - u_min", limits.u_max - limits.u_min)):
+            if (size > most).any():
+                raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
     @property
     def memory(self) -> int:
-        return self.rules.sparsity_horizon
+        return self.rules.memory
 
     def _planned_from(self, state: ControllerState) -> ControllerState:
         """A pattern says which inputs move, so none may be outside its limits when it is chosen."""
-        last = state.inputs[-1]
-        inside = (last <= self._u_max).all() and (last >= self._u_min).all()
-        return state if inside else self._brought_inside(state)
+        for u, (low, high) in zip(state.inputs[-1].tolist(), self._u_range, strict=True):
+            if not low <= u <= high:
+                return self._brought_inside(state)
+        return state
+
+    def _price(self, moves: Array) -> float:
+        return self._admissible.charge(moves != 0.0)
 
     def _plan(self, instance: Instance, state: ControllerState) -> Plan:
-        if state.samples >= self._search.warm_up:
-            return self._search.plan(instance, state)
+        search = self._search
+        if search is None:
+            return self._unrestricted(instance)
+        if state.samples >= search.warm_up:
+            return search.plan(instance, state)
         plan = self._unrestricted(instance)
-        return plan if plan.moves is None else plan._replace(status=Status.WARM_UP, lower_bound=-np.inf)
+        if plan.moves is None:
+            return plan
+        return plan._replace(status=Status.WARM_UP, lower_bound=-np.inf, objective=None)
 
 
-def _method(method: str | Method) -> Method:
+def method_of(method: str | Method, settings: Mapping[str, Any]) -> Method:
+    """A method object from its name and settings, or the object itself; raises `MampcError`."""
     if isinstance(method, str):
         if method not in METHODS:
-            raise MampcError(f"method: expected one of {sorted(METHODS)}, received {method!r}")
-        return METHODS[method]()
+            raise MampcError(f"method: expected one of {', '.join(METHODS)}, received {method!r}")
+        known = [field.name for field in fields(METHODS[method])]
+        unknown = sorted(set(settings) - set(known))
+        if unknown:
+            raise MampcError(
+                f"method {method!r}: expected settings among {', '.join(known)}, received {', '.join(unknown)}"
+            )
+        chosen: Method = METHODS[method](**settings)
+        return chosen
     if not hasattr(method, "prepare") or isinstance(method, type):
         raise MampcError(f"method: expected a name or a method object, received {method!r}")
+    if settings:
+        raise MampcError(
+            f"method: expected settings inside the method object, received {', '.join(settings)} beside it"
+        )
     return method

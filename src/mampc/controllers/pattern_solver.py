@@ -3,39 +3,143 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import NamedTuple
 
 import numpy as np
 
-from mampc.arrays import BoolArray
+from mampc.arrays import Array, BoolArray
 from mampc.condensing import CondensedQP, Instance, Restriction
-from mampc.qp import QPSolution, QPStatus
+from mampc.patterns import Admissible
+from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver
 
 MOST_KEPT = 4096  # patterns whose solvers are kept, some ten kilobytes each
+SMALLER = 1e-8  # input units: a move that falls short of its least size by no more is rounded up to it
+
+
+class OnPattern(NamedTuple):
+    """The best moves on a pattern, shape (n_moves,), with their objective, price included.
+
+    The moves are None where there are none below the cutoff: the objective is then a lower bound.
+    Multipliers, shape (n_bounds,) and positive at upper bounds, are those without least sizes of moves.
+    """
+
+    moves: Array | None
+    objective: float
+    status: QPStatus
+    multipliers: Array | None
+    iterations: int
+
+
+class Incumbent:
+    """The best plan found so far, and the work it took."""
+
+    __slots__ = ("failure", "moves", "multipliers", "objective", "solved")
+
+    def __init__(self) -> None:
+        self.moves: Array | None = None
+        self.objective = np.inf
+        self.multipliers: Array | None = None
+        self.solved = 0
+        self.failure: QPStatus | None = None
+
+    def offer(self, on_pattern: OnPattern) -> bool:
+        """Take the moves of a pattern if they are better; says whether they were."""
+        self.solved += 1
+        if on_pattern.status not in (QPStatus.OPTIMAL, QPStatus.INFEASIBLE):
+            self.failure = on_pattern.status
+        if on_pattern.moves is None or on_pattern.objective >= self.objective:
+            return False
+        self.moves, self.objective = on_pattern.moves, on_pattern.objective
+        self.multipliers = on_pattern.multipliers
+        return True
 
 
 class PatternSolver:
-    """Solves the condensed program restricted to one pattern at a time, keeping recent solvers warm."""
+    """Solves the condensed program on one pattern at a time, keeping recent solvers warm.
 
-    def __init__(self, condensed: CondensedQP) -> None:
-        self.condensed = condensed
+    Where moves have a least size, each must be at most -size or at least +size: a small search over
+    signs, those of the optimum without least sizes first.
+    """
+
+    def __init__(self, condensed: CondensedQP, admissible: Admissible) -> None:
+        self.condensed, self.admissible = condensed, admissible
         self._kept: OrderedDict[bytes, tuple[Restriction, DaqpSolver]] = OrderedDict()
 
-    def solve(self, instance: Instance, pattern: BoolArray) -> QPSolution:
-        """The best moves d, shape (n_moves,), that are zero off `pattern`; multipliers are not reported."""
-        moves = np.zeros(self.condensed.n_moves)
-        if not pattern.any():
-            return QPSolution(moves, None, QPStatus.OPTIMAL, 0)
-        restriction, solver = self._solver(pattern)
-        solution = solver.solve(
-            instance.f[restriction.columns],
-            instance.lower[restriction.bounds],
-            instance.upper[restriction.bounds],
+    def solve(self, instance: Instance, pattern: BoolArray, cutoff: float = np.inf) -> OnPattern:
+        """The best moves that are zero off `pattern`, if their objective is below `cutoff`."""
+        base = instance.constant + self.admissible.charge(pattern)
+        v, n = self.condensed.n_violations, self.condensed.n_moves
+        if not pattern.any() and not v:
+            return OnPattern(np.zeros(n) if base < cutoff else None, base, QPStatus.OPTIMAL, None, 0)
+        unlimited = None if pattern.tobytes() in self._kept else self._unlimited(instance, pattern)
+        if unlimited is not None:
+            objective = base + 0.5 * float(instance.f_moves.dot(unlimited))
+            return OnPattern(unlimited if objective < cutoff else None, objective, QPStatus.OPTIMAL, None, 0)
+        (program, columns, bounds), solver = self._solver(pattern)
+        f, H = instance.f[columns], program.H
+        sizes = self.admissible.min_size[pattern]
+        best, least, status = None, cutoff, QPStatus.INFEASIBLE
+        multipliers, iterations, pending = None, 0, [(instance.lower[bounds], instance.upper[bounds])]
+        while pending:
+            lower, upper = pending.pop()
+            solution = solver.solve(f, lower, upper)
+            iterations += solution.iterations
+            z = solution.z
+            if z is None:
+                if solution.status not in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA):
+                    return OnPattern(None, -np.inf, solution.status, multipliers, iterations)
+                continue
+            status = QPStatus.OPTIMAL
+            objective = base + float(z.dot(0.5 * H.dot(z) + f))
+            if multipliers is None and solution.multipliers is not None:
+                multipliers = np.zeros(len(instance.lower))
+                multipliers[bounds] = solution.multipliers
+                if objective >= cutoff:
+                    return OnPattern(None, objective, status, multipliers, iterations)
+            if objective >= least:
+                continue
+            d = z[v:]
+            if self.admissible.sized:
+                short = sizes - np.abs(d)
+                worst = int(short.argmax())
+                if short[worst] > SMALLER:
+                    pending += _apart(lower, upper, v + worst, sizes[worst], d[worst])
+                    continue
+                d = np.where(short > 0, np.copysign(sizes, d), d)
+            best, least = d, objective
+        if best is None:
+            return OnPattern(
+                None, np.inf if status is QPStatus.INFEASIBLE else least, status, multipliers, iterations
+            )
+        moves = np.zeros(n)
+        moves[pattern] = best
+        return OnPattern(moves, least, status, multipliers, iterations)
+
+    def offer(self, instance: Instance, pattern: BoolArray, best: Incumbent) -> OnPattern:
+        """Offer the best moves on a pattern; where moves have a least size, also with single ones left out."""
+        solved, before = self.solve(instance, pattern, best.objective), best.objective
+        best.offer(solved)
+        while self.admissible.sized and best.objective < before and best.moves is not None:
+            before, moves = best.objective, best.moves
+            for i in np.flatnonzero(moves):
+                fewer = moves != 0
+                fewer[i] = False
+                best.offer(self.solve(instance, fewer, best.objective))
+        return solved
+
+    def _unlimited(self, instance: Instance, pattern: BoolArray) -> Array | None:
+        """The optimum without limits if it keeps all of them: no solver has to be set up for it."""
+        chosen, v = np.flatnonzero(pattern), self.condensed.n_violations
+        moves = np.zeros(len(pattern))
+        moves[chosen] = d = -np.linalg.solve(
+            self.condensed.H[chosen[:, None], chosen], instance.f_moves[chosen]
         )
-        if solution.z is None:
-            return solution
-        moves[pattern] = solution.z[self.condensed.n_violations :]
-        return QPSolution(moves, None, solution.status, solution.iterations)
+        rows = self.condensed.bounded_rows[:, chosen] @ d
+        inside = (rows >= instance.lower[v:]).all() and (rows <= instance.upper[v:]).all()
+        if not inside or (self.admissible.sized and (np.abs(d) < self.admissible.min_size[chosen]).any()):
+            return None
+        return moves
 
     def _solver(self, pattern: BoolArray) -> tuple[Restriction, DaqpSolver]:
         key = pattern.tobytes()
@@ -48,3 +152,17 @@ class PatternSolver:
         else:
             self._kept.move_to_end(key)
         return entry
+
+
+def _apart(lower: Array, upper: Array, at: int, size: float, value: float) -> list[tuple[Array, Array]]:
+    """The bounds with z[at] <= -size and with z[at] >= size, the one nearer to `value` last."""
+    children = []
+    for sign in (-1, 1) if value >= 0 else (1, -1):
+        low, high = lower.copy(), upper.copy()
+        if sign > 0:
+            low[at] = max(low[at], size)
+        else:
+            high[at] = min(high[at], -size)
+        if low[at] <= high[at]:
+            children.append((low, high))
+    return children

@@ -1,0 +1,146 @@
+"""The sparse problem solved exactly, with a proof.
+
+Every admissible pattern has a lower bound that needs no solver: its optimum without limits. Patterns are
+taken best bound first; where the optimum keeps every limit, it is the pattern's own and the search is over;
+otherwise a quadratic program on the pattern gives its best moves and, as a by-product, multipliers of the
+limits. Any multipliers turn the limits into a change of the linear term (Lagrangian relaxation), so that all
+patterns can be ranked again with limits priced in. The search ends when no bound beats the best plan.
+
+Few patterns are listed in a table (`ranking`); more are searched as a tree (`tree`) by the same bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from mampc.arrays import Array, BoolArray, as_number
+from mampc.condensing import CondensedQP, Instance
+from mampc.controllers.controller import HELD_BY, INSIDE, Plan
+from mampc.controllers.decision import ControllerState, Remark, Status
+from mampc.controllers.local_search import LocalSearch
+from mampc.controllers.pattern_solver import Incumbent, PatternSolver
+from mampc.controllers.ranking import Ranking, ranking_of
+from mampc.controllers.tree import PatternTree
+from mampc.patterns import MoveRules, Past
+
+TIE = 1e-10  # of the cost: plans nearer than this are equally good
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exact:
+    """Settings of the exact search.
+
+    Args:
+        time_limit: seconds a sample may take; then the best plan so far is given with a valid lower bound
+            and the status `time_limit`. None searches until the optimum is proven.
+    """
+
+    time_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.time_limit is not None:
+            as_number("time_limit", self.time_limit, 0.0, exclusive=True)
+
+    def prepare(self, condensed: CondensedQP, rules: MoveRules) -> ExactSearch:
+        """The search for one problem and one set of rules."""
+        return ExactSearch(self, condensed, rules)
+
+
+class ExactSearch:
+    """The exact search, prepared for one condensed problem."""
+
+    warm_up = 0
+
+    def __init__(self, settings: Exact, condensed: CondensedQP, rules: MoveRules) -> None:
+        problem = condensed.problem
+        self.settings, self.condensed = settings, condensed
+        self.admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
+        self._solver = PatternSolver(condensed, self.admissible)
+        self._ranking = ranking_of(condensed, self.admissible)
+        if self._ranking is None:
+            self._tree = PatternTree(condensed, self.admissible)
+            self._local = LocalSearch(condensed, self.admissible)
+
+    def plan(self, instance: Instance, state: ControllerState) -> Plan:
+        """The best moves of all admissible patterns for one sample."""
+        past = self.admissible.past(state.inputs)
+        if past.exceeded:
+            return self._search(instance, past)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
+        return self._search(instance, past)
+
+    def _search(self, instance: Instance, past: Past) -> Plan:
+        ranking = self._ranking
+        if ranking is None:
+            return self._search_tree(instance, past)
+        bounds = ranking.bounds(instance.f_moves, past)
+        best = int(bounds.argmin())
+        if not self.admissible.sized:
+            optimum = ranking.optimum(best, instance)
+            margins = optimum.margins
+            if not len(margins) or margins[margins.argmin()] > INSIDE:
+                return Plan(
+                    optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs,
+                    optimum.cost + ranking.charge[best],
+                )  # fmt: skip
+        return self._search_ranking(ranking, bounds, instance, past)
+
+    def _deadline(self) -> float:
+        limit = self.settings.time_limit
+        return np.inf if limit is None else perf_counter() + 0.95 * limit
+
+    def _search_ranking(self, ranking: Ranking, bounds: Array, instance: Instance, past: Past) -> Plan:
+        """Patterns of the table best bound first, ranked again with the multipliers of each program solved."""
+        best, deadline = Incumbent(), self._deadline()
+        bounds += instance.constant
+        tie = TIE * max(1e-6, instance.constant)
+        while True:
+            index = int(bounds.argmin())
+            bound = float(bounds[index])
+            if bound >= best.objective - tie or bound == np.inf:
+                return self._plan(instance, best, best.objective)
+            if perf_counter() > deadline:
+                return self._plan(instance, best, bound, Status.TIME_LIMIT)
+            solved = self._solver.solve(instance, ranking.patterns[index], best.objective)
+            best.offer(solved)
+            bounds[index] = np.inf
+            if solved.multipliers is not None:
+                f, constant = self.condensed.relaxed_limits(instance, solved.multipliers)
+                np.maximum(bounds, ranking.bounds(f, past) + constant, out=bounds)
+
+    def _search_tree(self, instance: Instance, past: Past) -> Plan:
+        """A good plan by local search, then the tree of everything that may beat it."""
+        best, deadline = Incumbent(), self._deadline()
+        best.offer(self._solver.solve(instance, np.zeros(self.condensed.n_moves, dtype=bool)))
+        self._local.offer(self._solver, instance, past, best)
+        f, constant = instance.f_moves, instance.constant
+        if best.multipliers is not None:
+            f, constant = self.condensed.relaxed_limits(instance, best.multipliers)
+        tie = TIE * max(1e-6, instance.constant)
+
+        def leaf(pattern: BoolArray, bound: float) -> float:
+            best.offer(self._solver.solve(instance, pattern, best.objective))
+            return best.objective - tie - constant
+
+        cutoff = best.objective - tie - constant
+        open_bound = self._tree.search(f, past, cutoff, deadline, leaf) + constant
+        if open_bound < best.objective - tie:
+            return self._plan(instance, best, open_bound, Status.TIME_LIMIT)
+        return self._plan(instance, best, best.objective)
+
+    def _plan(
+        self, instance: Instance, best: Incumbent, bound: float, status: Status = Status.OPTIMAL
+    ) -> Plan:
+        if best.failure is not None:  # a pattern without an answer leaves the rest unproven
+            bound, status = -np.inf, Status.FEASIBLE
+        if best.moves is None:
+            if status is Status.OPTIMAL:
+                return Plan(None, Status.HELD_INFEASIBLE, best.solved)
+            if best.failure is not None:
+                return Plan(None, HELD_BY[best.failure], best.solved)
+            hold = np.zeros(self.condensed.n_moves)
+            return Plan(hold, status, best.solved, bound)
+        lower = None if status is Status.OPTIMAL else min(bound, best.objective)
+        return Plan(best.moves, status, best.solved, lower, None, None, best.objective)

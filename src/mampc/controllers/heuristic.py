@@ -1,0 +1,123 @@
+"""What the methods without a proof share: they propose patterns, and the best plan on any of these is taken."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from mampc.arrays import Array
+from mampc.condensing import CondensedQP, Instance
+from mampc.controllers.controller import HELD_BY, INSIDE, Plan
+from mampc.controllers.decision import ControllerState, Remark, Status
+from mampc.controllers.exact import TIE, Exact
+from mampc.controllers.pattern_solver import Incumbent, PatternSolver
+from mampc.patterns import MoveRules, Past
+from mampc.qp_daqp import DaqpSolver
+
+CERTIFY_SECONDS = 1.0  # that a certificate may take, per sample
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heuristic(ABC):
+    """Settings that these methods share.
+
+    Args:
+        certify: search the exact optimum as well, for at most a second a sample, so that decisions report
+            a lower bound and a gap.
+    """
+
+    certify: bool = False
+
+    @abstractmethod
+    def prepare(self, condensed: CondensedQP, rules: MoveRules) -> HeuristicSearch:
+        """The search for one problem and one set of rules."""
+
+
+class HeuristicSearch:
+    """A method prepared for one condensed problem: all it adds is `_propose`."""
+
+    warm_up = 0
+
+    def __init__(self, settings: Heuristic, condensed: CondensedQP, rules: MoveRules) -> None:
+        problem = condensed.problem
+        self.condensed, self.rules = condensed, rules
+        self.admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
+        self._solver = PatternSolver(condensed, self.admissible)
+        self._relaxed: DaqpSolver | None = None
+        self._referee = (
+            Exact(time_limit=CERTIFY_SECONDS).prepare(condensed, rules) if settings.certify else None
+        )
+
+    def plan(self, instance: Instance, state: ControllerState) -> Plan:
+        """The best plan on any proposed pattern."""
+        past, best = self.admissible.past(state.inputs), Incumbent()
+        rounds, guess = 0, None
+        if past.left:
+            last = None if state.guess is None else state.guess.ravel()
+            rounds, guess = self._propose(instance, past, last, best)
+        return self._certified(
+            self._best(instance, best, past, rounds, self._shifted(guess)), instance, state
+        )
+
+    def _propose(
+        self, instance: Instance, past: Past, guess: Array | None, best: Incumbent
+    ) -> tuple[int, Array | None]:
+        """Offer plans to `best`; returns the rounds this took and moves, (n_moves,), to start the next sample from."""
+        return 0, None
+
+    def _best(
+        self,
+        instance: Instance,
+        best: Incumbent,
+        past: Past,
+        rounds: int,
+        guess: Array | None,
+        status: Status = Status.FEASIBLE,
+    ) -> Plan:
+        """The best plan offered, as an answer; no moves at all is always among them."""
+        best.offer(self._solver.solve(instance, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
+        remarks = self._remarks(past)
+        if best.moves is None:
+            held = Status.HELD_INFEASIBLE if best.failure is None else HELD_BY[best.failure]
+            return Plan(None, held, rounds, guess=guess, remarks=remarks)
+        return Plan(best.moves, status, rounds, guess=guess, objective=best.objective, remarks=remarks)
+
+    def _remarks(self, past: Past) -> tuple[Remark, ...]:
+        return (Remark.BUDGET_EXCEEDED,) if past.exceeded else ()
+
+    def _priced_limits(self, instance: Instance) -> Array:
+        """The linear term of the moves, with the limits priced by the multipliers of plain MPC."""
+        margins = instance.margins
+        if margins[margins.argmin()] > INSIDE:
+            return instance.f_moves
+        if self._relaxed is None:
+            self._relaxed = DaqpSolver(self.condensed.program)
+        solution = self._relaxed.solve(instance.f, instance.lower, instance.upper)
+        if solution.multipliers is None:
+            return instance.f_moves
+        return self.condensed.relaxed_limits(instance, solution.multipliers)[0]
+
+    def _shifted(self, moves: Array | None) -> Array | None:
+        """Moves as they stand one sample later, shape (nc, m)."""
+        if moves is None:
+            return None
+        m = self.admissible.n_inputs
+        return np.concatenate([moves[m:], np.zeros(m)]).reshape(-1, m)
+
+    def _certified(self, plan: Plan, instance: Instance, state: ControllerState) -> Plan:
+        """The plan with a proven lower bound, where that is asked for."""
+        if self._referee is None:
+            return plan
+        proof = self._referee.plan(instance, state)
+        if proof.objective is None or plan.objective is None:
+            return plan
+        bound = proof.objective if proof.lower_bound is None else proof.lower_bound
+        if plan.status is Status.FEASIBLE and plan.objective - bound <= 10 * TIE * max(
+            1e-6, instance.constant
+        ):
+            return plan._replace(status=Status.OPTIMAL, lower_bound=None)
+        return plan._replace(
+            lower_bound=min(bound, plan.objective) if plan.status is Status.FEASIBLE else bound
+        )

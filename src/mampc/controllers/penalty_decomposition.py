@@ -1,0 +1,83 @@
+"""Penalty decomposition: the alternating minimisation with a penalty that grows until copies agree.
+
+    minimise J(d) + mu |v - d|^2 over d within the limits and v on an admissible pattern
+
+by turns in d and v until both settle; then mu grows, until |d - v| vanishes (Lu and Zhang 2013). Unlike the
+paper's fixed mu, the pattern may still change while the penalty is small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mampc.arrays import Array, as_number, as_whole
+from mampc.condensing import CondensedQP, Instance
+from mampc.controllers.alternating import FirstStep, alternate
+from mampc.controllers.heuristic import Heuristic, HeuristicSearch
+from mampc.controllers.pattern_solver import Incumbent
+from mampc.patterns import MoveRules, Past
+from mampc.qp import QPStatus
+
+MOST_GROWTHS = 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class PenaltyDecomposition(Heuristic):
+    """Settings of the penalty decomposition.
+
+    Args:
+        penalty: first mu, as a multiple of the mean curvature of the moves.
+        growth: factor of mu, above 1.
+        tolerance: largest |d - v| at the end, and change of the plan that counts as settled, in input units.
+        max_iterations: rounds of both steps for one mu.
+    """
+
+    penalty: float = 0.01
+    growth: float = 4.0
+    tolerance: float = 1e-4
+    max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        as_number("penalty", self.penalty, 0.0, exclusive=True)
+        as_number("growth", self.growth, 1.0, exclusive=True)
+        as_number("tolerance", self.tolerance, 0.0, exclusive=True)
+        as_whole("max_iterations", self.max_iterations, 1)
+
+    def prepare(self, condensed: CondensedQP, rules: MoveRules) -> HeuristicSearch:
+        return PenaltyDecompositionSearch(self, condensed, rules)
+
+
+class PenaltyDecompositionSearch(HeuristicSearch):
+    """The penalty decomposition, prepared for one condensed problem."""
+
+    def __init__(self, settings: PenaltyDecomposition, condensed: CondensedQP, rules: MoveRules) -> None:
+        super().__init__(settings, condensed, rules)
+        self.settings = settings
+        self._mu = settings.penalty * float(np.diag(condensed.H).mean())
+        self._first_steps: list[FirstStep] = []
+
+    def _propose(
+        self, instance: Instance, past: Past, guess: Array | None, best: Incumbent
+    ) -> tuple[int, Array | None]:
+        settings, rounds = self.settings, 0
+        v: Array = np.zeros(self.condensed.n_moves) if guess is None else guess
+        for number in range(MOST_GROWTHS):
+            if number == len(self._first_steps):
+                self._first_steps.append(FirstStep(self.condensed, self._mu * settings.growth**number))
+            first_step = self._first_steps[number]
+            mu = first_step.mu
+            inner = alternate(
+                first_step, instance, v, lambda d, mu=mu: self.admissible.select(mu * d * d, past),  # type: ignore[misc]
+                settings.tolerance, settings.max_iterations,
+            )  # fmt: skip
+            rounds += inner.rounds
+            if inner.status is not QPStatus.OPTIMAL:
+                best.failure = inner.status
+                return rounds, None
+            v = inner.v
+            if np.abs(inner.d - v).max() <= settings.tolerance:
+                break
+        self._solver.offer(instance, v != 0, best)
+        return rounds, v
