@@ -35,10 +35,11 @@ class Exact:
 
     Args:
         time_limit: seconds a sample may take; then the best plan so far is given with a valid lower bound
-            and the status `time_limit`. None searches until the optimum is proven.
+            and the status `time_limit`. Problems of some dozen moves take milliseconds; None searches on until
+            the optimum is proven, whatever it takes.
     """
 
-    time_limit: float | None = None
+    time_limit: float | None = 1.0
 
     def __post_init__(self) -> None:
         if self.time_limit is not None:
