@@ -197,10 +197,10 @@ class PatternTree:
         matrices[:, np.arange(width), np.arange(width)] += none
         if not self.admissible.sized:
             optima = -np.linalg.solve(matrices, linear[:, :, None])[:, :, 0]
-            return np.einsum("ni,ni->n", 0.5 * linear, optima)
+            values: Array = 0.5 * (linear * optima).sum(axis=1)
+            return values
         inverses = np.linalg.inv(matrices)
         optima = -(inverses @ linear[:, :, None])[:, :, 0]
         short = np.maximum(self._sizes[chosen] - np.abs(optima), 0.0)  # -1 has size zero
         lift = 0.5 * (short * short / np.einsum("nii->ni", inverses)).max(axis=1)
-        values: Array = 0.5 * (linear * optima).sum(axis=1) + lift
-        return values
+        return np.asarray(0.5 * (linear * optima).sum(axis=1) + lift)

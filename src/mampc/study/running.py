@@ -13,7 +13,6 @@ from mampc.arrays import Array, as_vector
 from mampc.condensing import CondensedQP
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
-from mampc.controllers.mampc import METHODS
 from mampc.errors import MampcError, StudyError
 from mampc.estimation import KalmanFilter
 from mampc.identification import Identified, IOData, excite, n4sid
@@ -183,8 +182,10 @@ def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
     if table.method == "mpc":
         return MPC(problem)
     assert table.rules is not None
-    method = METHODS[table.method](**table.settings)  # checked with the study
-    return MAMPC(problem, MoveRules(**table.rules.model_dump()), method=method)
+    try:
+        return MAMPC(problem, MoveRules(**table.rules.model_dump()), method=table.method, **table.settings)
+    except MampcError as error:
+        raise StudyError(f"controllers, {table.name!r}: {error}") from None
 
 
 def _estimator(study: Study, model: StateSpace) -> KalmanFilter:

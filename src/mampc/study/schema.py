@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
 
 from mampc.arrays import LARGEST
-from mampc.controllers.mampc import METHODS
+from mampc.controllers.mampc import METHODS, method_of
 from mampc.errors import MampcError
+from mampc.patterns import MoveRules
 from mampc.plants import QuadrupleTank, SolidOxideFuelCell
 from mampc.problem import LONGEST_HORIZON
 
@@ -94,6 +94,7 @@ class ProblemTable(Table):
     limits: LimitsTable = LimitsTable()
     weigh_first_move: bool = True
     output_limit_weight: Positive = 1e4
+    tail_horizon: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
 
 class ChangeTable(Table):
@@ -127,6 +128,20 @@ class PublishedTable(Table):
 class RulesTable(Table):
     max_moves: Annotated[int, Field(ge=0)] | None = None
     sparsity_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = 1
+    price: Values = 0.0
+    counting: Literal["elementwise", "simultaneous"] = "elementwise"
+    min_size: Values = 0.0
+    dwell: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = 1
+    max_moves_per_step: Annotated[int, Field(ge=1)] | None = None
+    blocks: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> RulesTable:
+        try:
+            MoveRules(**self.model_dump())
+        except MampcError as error:
+            raise ValueError(f"other rules: {error}") from None
+        return self
 
 
 class ControllerTable(Table):
@@ -138,22 +153,18 @@ class ControllerTable(Table):
 
     @model_validator(mode="after")
     def _rules_where_needed(self) -> ControllerTable:
-        if self.method not in ("mpc", *METHODS):
+        if self.method == "mpc":
+            if self.rules is not None or self.settings:
+                raise ValueError("neither rules nor settings for the method 'mpc', which has none")
+            return self
+        if self.method not in METHODS:
             raise ValueError(f"a method, one of {', '.join(('mpc', *METHODS))}; received {self.method!r}")
-        if self.method != "mpc" and self.rules is None:
+        if self.rules is None:
             raise ValueError(f"rules for the method {self.method!r}, such as rules = {{ max_moves = 3 }}")
-        if self.method == "mpc" and (self.rules is not None or self.settings):
-            raise ValueError("neither rules nor settings for the method 'mpc', which has none")
-        if self.method != "mpc":
-            try:
-                METHODS[self.method](**self.settings)
-            except TypeError:
-                known = ", ".join(field.name for field in fields(METHODS[self.method]))
-                raise ValueError(f"settings among {known}; received {sorted(self.settings)}") from None
-            except MampcError as error:
-                raise ValueError(f"other settings: {error}") from None
-            if self.rules is not None and self.rules.max_moves is None:
-                raise ValueError(f"rules.max_moves for the method {self.method!r}")
+        try:
+            method_of(self.method, self.settings)
+        except MampcError as error:
+            raise ValueError(f"other settings: {error}") from None
         return self
 
 
