@@ -27,6 +27,7 @@ from mampc.identification import Identified, IOData, Validation, excite, n4sid, 
 from mampc.lti import StateSpace, linearise
 from mampc.metrics import Metrics
 from mampc.names import Names
+from mampc.offset import largest_offset
 from mampc.patterns import MoveRules
 from mampc.problem import Limits, TrackingProblem
 from mampc.regulator import Regulator, RegulatorState
@@ -67,6 +68,7 @@ __all__ = [
     "TrackingProblem",
     "Validation",
     "excite",
+    "largest_offset",
     "linearise",
     "n4sid",
     "plants",

@@ -148,6 +148,7 @@ class CondensedQP:
         theta: predicted outputs per move, shape ((np + 1) l, n_moves).
         cumulate: u_j - u_prev per move, shape (n_moves, n_moves).
         weighted_theta: Q^(1/2) theta, and below it the weighted tail's rows, shape (n_errors, n_moves).
+        error_of_reference: what a constant reference adds to the error, shape (n_errors, l).
         map_bytes: about the memory that an `optimum_on` some pattern takes.
         violation_scale: sqrt(q) of `TrackingProblem`, per output, shape (l,).
 
@@ -222,6 +223,7 @@ class CondensedQP:
             error=error, lower=lower, upper=upper,
         )  # fmt: skip
         self.map_bytes = self._preview_map.nbytes
+        self.error_of_reference = self._with_constant_reference(error)[:, self._one_at + 1 :]
         self._constant_map = self._with_constant_reference(self._preview_map)
         parts: tuple[Array, Array, Array, Array] = np.zeros(m), np.zeros(l), model.v_op, np.ones(1)
         self._undisturbed_parts, self._undisturbed = parts, np.concatenate(parts)  # (d_u, d_y, v, 1)
