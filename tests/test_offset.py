@@ -60,7 +60,7 @@ def test_an_offset_that_stays_is_within_the_bound_of_its_price(seed):
         control_horizon=3,
         move_weight=0.01,
         output_weight=rng.uniform(0.5, 2, 2),
-        tail_horizon=2000.0,
+        tail_horizon=1e5,
     )
     price = float(10 ** rng.uniform(-2, 2))
     rules = mampc.MoveRules(price=price, counting=["elementwise", "simultaneous"][seed % 2])
