@@ -170,16 +170,6 @@ def test_a_polished_plan_is_the_best_one_on_its_pattern():
             assert cost_of(problem, x, past[-1], reference, plan) > decision.objective
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_growing_penalty_drives_moves_off_the_pattern_below_the_tolerance(seed):
-    problem, rules, past, x, reference = random_case(seed)
-    controller = ours(problem, rules, tolerance=1e-5, penalty_growth=3.0, max_iterations=20_000)
-    decision = decide(controller, past, x, reference)
-    assert decision.status is Status.SETTLED
-    off_pattern = decision.changes[~largest_of_the_window(rules, past, decision.changes)]
-    assert np.abs(off_pattern).max(initial=0.0) <= 1e-5
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_a_budget_for_all_moves_gives_plain_mpc(seed):
     problem, rules, past, x, reference = random_case(seed)
@@ -251,8 +241,8 @@ def test_the_window_holds_one_past_change_less_than_the_sparsity_horizon():
     inputs = np.array([[1.0], [2.0], [4.0], [4.0], [8.0]])
     rules = mampc.MoveRules(max_moves=4, sparsity_horizon=3)
     np.testing.assert_array_equal(rules.past_changes(inputs), [[0.0], [4.0]])
-    assert rules.moves_left(inputs, available=10) == 3
-    assert rules.moves_left(inputs, available=2) == 2
+    assert rules.fitted(n_inputs=1, control_horizon=10).past(inputs).left == 3
+    assert rules.fitted(n_inputs=1, control_horizon=2).past(inputs).left == 2
 
 
 def test_the_next_sample_starts_from_the_shifted_pattern():
@@ -337,13 +327,7 @@ def test_without_any_limit_the_polished_plan_is_the_best_on_its_pattern():
 def test_rounding_of_what_was_applied_is_no_move():
     rules = mampc.MoveRules(max_moves=1, sparsity_horizon=3)
     wobbly = np.array([[50.0, 50.0], [50.0 + 1e-12, 50.0], [50.0, 50.0 - 1e-12]])
-    assert rules.moves_left(wobbly, 10) == 1
-
-
-def test_an_immense_penalty_growth_still_ends():
-    controller = ours(tank_problem(), mampc.MoveRules(max_moves=3), penalty_growth=1e100)
-    decision = decide(controller, [50.0, 50.0], np.ones(4), controller.problem.model.y_op)
-    assert np.isfinite(decision.plan).all()
+    assert rules.fitted(n_inputs=2, control_horizon=5).past(wobbly).left == 1
 
 
 def test_output_limits_are_softened_in_every_round():
@@ -366,7 +350,6 @@ def test_output_limits_are_softened_in_every_round():
         {"tolerance": np.inf},
         {"max_iterations": 0},
         {"max_iterations": 2.5},
-        {"penalty_growth": 0.5},
         {"warm_up": -1},
         {"warm_up": True},
     ],
@@ -377,6 +360,13 @@ def test_settings_out_of_range_are_refused(settings):
         mampc.Alternating(**settings)
 
 
-def test_rules_without_a_budget_are_refused():
-    with pytest.raises(mampc.MampcError, match=r"expected.*max_moves.*received"):
-        mampc.MAMPC(tank_problem(), mampc.MoveRules())
+def test_rules_beyond_a_budget_are_kept_by_the_second_step():
+    """A fixed point under a price: on the pattern every |d|^2 mu is worth its price."""
+    problem, _, past, x, reference = random_case(2)
+    prices = (0.0, 0.3, 30.0)
+    plans = [
+        decide(ours(problem, mampc.MoveRules(price=price), polish=True), past, x, reference)
+        for price in prices
+    ]
+    moves = [int(decision.moves.sum()) for decision in plans]
+    assert moves[0] > moves[1] > moves[2] == 0

@@ -301,7 +301,7 @@ def test_on_the_identified_tank_the_alternating_method_moves_far_less_and_tracks
     rules = mampc.MoveRules(max_moves=3, sparsity_horizon=3)
     mpc, sparse = (
         mampc.simulate(TANK, mampc.Regulator(controller), tank_reference(), noise=0.1, seed=0).metrics()
-        for controller in (mampc.MPC(problem), mampc.MAMPC(problem, rules))
+        for controller in (mampc.MPC(problem), mampc.MAMPC(problem, rules, method="alternating"))
     )
     assert (mpc.exact_density > 0.95).all()
     assert ((mpc.sparse_density > 0.3) & (mpc.sparse_density < 0.8)).all()

@@ -101,7 +101,7 @@ def test_progress_counts_every_run():
     short = study.model_copy(update={"steps": 20, "skip": 0})
     seen = []
     points = sensitivity(
-        short, short.scenarios[0], short.controllers[-1], {"penalty": [1.0, 10.0], "max_moves": [2]}, jobs=1,
+        short, short.scenarios[0], short.controllers[3], {"penalty": [1.0, 10.0], "max_moves": [2]}, jobs=1,
         on_point=lambda done, total: seen.append((done, total)),
     )  # fmt: skip
     assert seen == [(1, 3), (2, 3), (3, 3)]

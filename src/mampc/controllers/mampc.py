@@ -20,7 +20,7 @@ from mampc.controllers.hard_thresholding import HardThresholding
 from mampc.controllers.l1 import L1, ReweightedL1
 from mampc.controllers.penalty_decomposition import PenaltyDecomposition
 from mampc.errors import MampcError
-from mampc.patterns import MoveRules
+from mampc.patterns import SAME, MoveRules
 from mampc.problem import TrackingProblem
 
 
@@ -103,11 +103,22 @@ class MAMPC(Controller):
         if search is None:
             return self._unrestricted(instance)
         if state.samples >= search.warm_up:
-            return search.plan(instance, state)
+            return _without_rounding(search.plan(instance, state))
         plan = self._unrestricted(instance)
         if plan.moves is None:
             return plan
         return plan._replace(status=Status.WARM_UP, lower_bound=-np.inf, objective=None)
+
+
+def _without_rounding(plan: Plan) -> Plan:
+    """The plan with moves too small to count as moves made exactly zero."""
+    moves = plan.moves
+    if moves is None:
+        return plan
+    counted = np.abs(moves) > SAME
+    if np.count_nonzero(counted) == np.count_nonzero(moves):
+        return plan
+    return plan._replace(moves=moves * counted, inputs=None, objective=None)
 
 
 def method_of(method: str | Method, settings: Mapping[str, Any]) -> Method:
