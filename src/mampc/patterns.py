@@ -190,8 +190,7 @@ class Admissible:
     def select(self, worth: Array, past: Past) -> BoolArray:
         """A pattern of large total worth less price, shape (n_moves,): best moves first, as rules allow.
 
-        Exact for budgets, prices and limits per sample; a greedy choice where dwell times bind or samples
-        with several moves compete.
+        The best pattern under budgets, prices and limits per sample; a greedy choice where dwell times bind.
         """
         m, growing = self.n_inputs, Growing(self, past)
         worth = np.where(self.open(past), worth, 0.0)
@@ -214,6 +213,9 @@ class Admissible:
                 break
             if worth[i] > 0:
                 growing.add(i)
+        if self.simultaneous and self.rules.dwell > 1:  # a sample may have got less than it was ranked by
+            got = (worth * growing.pattern).reshape(-1, m).sum(axis=1)
+            growing.pattern &= np.repeat(got > threshold, m)
         return growing.pattern
 
     def listed(self, most: int) -> BoolArray | None:
