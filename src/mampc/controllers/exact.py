@@ -25,6 +25,7 @@ from mampc.controllers.pattern_solver import Incumbent, PatternSolver
 from mampc.controllers.ranking import Ranking, ranking_of
 from mampc.controllers.tree import PatternTree
 from mampc.patterns import MoveRules, Past
+from mampc.qp import QPStatus
 
 TIE = 1e-10  # of the cost: plans nearer than this are equally good
 
@@ -104,8 +105,10 @@ class ExactSearch:
                 return self._plan(instance, best, best.objective)
             if perf_counter() > deadline:
                 return self._plan(instance, best, bound, Status.TIME_LIMIT)
-            solved = self._solver.solve(instance, ranking.patterns[index], best.objective)
+            solved = self._solver.solve(instance, ranking.patterns[index], best.objective, deadline)
             best.offer(solved)
+            if solved.status is QPStatus.TIME_LIMIT:
+                return self._plan(instance, best, bound, Status.TIME_LIMIT)
             bounds[index] = np.inf
             if solved.multipliers is not None:
                 f, constant = self.condensed.relaxed_limits(instance, solved.multipliers)
@@ -115,14 +118,14 @@ class ExactSearch:
         """A good plan by local search, then the tree of everything that may beat it."""
         best, deadline = Incumbent(), self._deadline()
         best.offer(self._solver.solve(instance, np.zeros(self.condensed.n_moves, dtype=bool)))
-        self._local.offer(self._solver, instance, past, best)
+        self._local.offer(self._solver, instance, past, best, deadline)
         f, constant = instance.f_moves, instance.constant
         if best.multipliers is not None:
             f, constant = self.condensed.relaxed_limits(instance, best.multipliers)
         tie = TIE * max(1e-6, instance.constant)
 
         def leaf(pattern: BoolArray, bound: float) -> float:
-            best.offer(self._solver.solve(instance, pattern, best.objective))
+            best.offer(self._solver.solve(instance, pattern, best.objective, deadline))
             return best.objective - tie - constant
 
         cutoff = best.objective - tie - constant

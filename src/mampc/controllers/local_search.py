@@ -79,7 +79,9 @@ class LocalSearch:
             exchanges.change(*choices[best])
         return exchanges.pattern
 
-    def offer(self, solver: PatternSolver, instance: Instance, past: Past, best: Incumbent) -> None:
+    def offer(
+        self, solver: PatternSolver, instance: Instance, past: Past, best: Incumbent, deadline: float = np.inf
+    ) -> None:
         """Offer the plans of a local search to the incumbent; multipliers of one round price limits in the next."""
         f, least_gain = instance.f_moves, LEAST_GAIN * instance.constant
         pattern = self.forward(f, past)
@@ -87,7 +89,7 @@ class LocalSearch:
             last, pattern = pattern, self.exchange(f, past, pattern, least_gain)
             if number and (pattern == last).all():
                 break
-            solved = solver.offer(instance, pattern, best)
+            solved = solver.offer(instance, pattern, best, deadline)
             if solved.multipliers is None or not solved.multipliers.any():
                 break
             f, _ = self.condensed.relaxed_limits(instance, solved.multipliers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ class OnPattern(NamedTuple):
 
     The moves are None where there are none below the cutoff: the objective is then a lower bound.
     Multipliers, shape (n_bounds,) and positive at upper bounds, are those without least sizes of moves.
+    The status is TIME_LIMIT where the deadline ended the search over signs: there may be better moves.
     """
 
     moves: Array | None
@@ -46,7 +48,7 @@ class Incumbent:
     def offer(self, on_pattern: OnPattern) -> bool:
         """Take the moves of a pattern if they are better; says whether they were."""
         self.solved += 1
-        if on_pattern.status not in (QPStatus.OPTIMAL, QPStatus.INFEASIBLE):
+        if on_pattern.status not in (QPStatus.OPTIMAL, QPStatus.INFEASIBLE, QPStatus.TIME_LIMIT):
             self.failure = on_pattern.status
         if on_pattern.moves is None or on_pattern.objective >= self.objective:
             return False
@@ -66,8 +68,13 @@ class PatternSolver:
         self.condensed, self.admissible = condensed, admissible
         self._kept: OrderedDict[bytes, tuple[Restriction, DaqpSolver]] = OrderedDict()
 
-    def solve(self, instance: Instance, pattern: BoolArray, cutoff: float = np.inf) -> OnPattern:
-        """The best moves that are zero off `pattern`, if their objective is below `cutoff`."""
+    def solve(
+        self, instance: Instance, pattern: BoolArray, cutoff: float = np.inf, deadline: float = np.inf
+    ) -> OnPattern:
+        """The best moves that are zero off `pattern`, if their objective is below `cutoff`.
+
+        A search over signs stops at the deadline, of `perf_counter`.
+        """
         base = instance.constant + self.admissible.charge(pattern)
         v, n = self.condensed.n_violations, self.condensed.n_moves
         if not pattern.any() and not v:
@@ -82,6 +89,9 @@ class PatternSolver:
         best, least, status = None, cutoff, QPStatus.INFEASIBLE
         multipliers, iterations, pending = None, 0, [(instance.lower[bounds], instance.upper[bounds])]
         while pending:
+            if multipliers is not None and perf_counter() > deadline:
+                status = QPStatus.TIME_LIMIT
+                break
             lower, upper = pending.pop()
             solution = solver.solve(f, lower, upper)
             iterations += solution.iterations
@@ -100,7 +110,7 @@ class PatternSolver:
             if objective >= least:
                 continue
             d = z[v:]
-            if self.admissible.sized:
+            if self.admissible.sized and len(d):
                 short = sizes - np.abs(d)
                 worst = int(short.argmax())
                 if short[worst] > SMALLER:
@@ -116,16 +126,20 @@ class PatternSolver:
         moves[pattern] = best
         return OnPattern(moves, least, status, multipliers, iterations)
 
-    def offer(self, instance: Instance, pattern: BoolArray, best: Incumbent) -> OnPattern:
+    def offer(
+        self, instance: Instance, pattern: BoolArray, best: Incumbent, deadline: float = np.inf
+    ) -> OnPattern:
         """Offer the best moves on a pattern; where moves have a least size, also with single ones left out."""
-        solved, before = self.solve(instance, pattern, best.objective), best.objective
+        solved, before = self.solve(instance, pattern, best.objective, deadline), best.objective
         best.offer(solved)
         while self.admissible.sized and best.objective < before and best.moves is not None:
             before, moves = best.objective, best.moves
             for i in np.flatnonzero(moves):
+                if perf_counter() > deadline:
+                    return solved
                 fewer = moves != 0
                 fewer[i] = False
-                best.offer(self.solve(instance, fewer, best.objective))
+                best.offer(self.solve(instance, fewer, best.objective, deadline))
         return solved
 
     def _unlimited(self, instance: Instance, pattern: BoolArray) -> Array | None:

@@ -114,6 +114,8 @@ class PatternTree:
                     chosen = children.chosen[made][row]
                     pattern[order[chosen[chosen >= 0]]] = True
                     cutoff = leaf(pattern, float(values[row]))
+                    if perf_counter() > deadline:  # these nodes bound their descendants, this leaf among them
+                        return float(min(some.bound.min() for _, some in [*pending, (level, nodes)]))
             if level + 1 == n:
                 continue
             children = self._growable(level, children, past)
