@@ -1,8 +1,13 @@
 """Independent re-computations: the move rules by their definitions, sparse optima by brute force and by SCIP."""
 
 from itertools import product
+from typing import NamedTuple
 
+import clarabel
 import numpy as np
+from scipy import sparse
+
+from builders import cost_of, predicted, violation_scale
 
 TINY = 1e-9  # changes below are rounding
 
@@ -55,3 +60,111 @@ def charge(rules, moves):
 def all_patterns(n_c, m):
     """Every boolean array (nc, m)."""
     return [np.array(bits, dtype=bool).reshape(n_c, m) for bits in product((False, True), repeat=n_c * m)]
+
+
+class Program(NamedTuple):
+    """The tracking problem of one sample as a dense program in z = (a, d), by simulating unit moves.
+
+    minimise constant + 1/2 z' H z + f' z  subject to  rows z <= bounds; a are the outputs' scaled violations
+    and d the moves, time-major.
+    """
+
+    H: np.ndarray
+    f: np.ndarray
+    constant: float
+    rows: np.ndarray
+    bounds: np.ndarray
+
+
+def program_of(problem, x, u_previous, reference):
+    """The dense program, from `predicted` outputs alone."""
+    model, limits, n_c, n_p = (
+        problem.model,
+        problem.limits,
+        problem.control_horizon,
+        problem.prediction_horizon,
+    )
+    m, l, n = model.n_inputs, model.n_outputs, n_c * model.n_inputs
+    rest = np.tile(u_previous, (n_c, 1))
+    free = predicted(model, x, rest, n_p + 1)
+    to_inputs = np.kron(np.tri(n_c), np.eye(m))  # u - u_previous = to_inputs d
+    theta = np.array(
+        [(predicted(model, x, rest + unit.reshape(n_c, m), n_p + 1) - free).ravel() for unit in to_inputs.T]
+    ).T
+    Q, R = np.kron(np.eye(n_p + 1), problem.output_weight), np.kron(np.eye(n_c), problem.move_weight)
+    error = (np.broadcast_to(reference, free.shape) - free).ravel()
+    scale, w = violation_scale(problem), problem.output_limit_weight
+    H = np.zeros((l + n, l + n))
+    H[:l, :l] = w * np.eye(l)
+    H[l:, l:] = 2 * (theta.T @ Q @ theta + R)
+    f = np.concatenate([np.full(l, w), -2 * theta.T @ Q @ error])
+    none, violation = np.zeros((n, l)), np.tile(np.diag(1 / scale), (n_p, 1))
+    rows = np.block([
+        [none, to_inputs], [none, -to_inputs], [none, np.eye(n)], [none, -np.eye(n)],
+        [-violation, theta[l:]], [-violation, -theta[l:]], [-np.eye(l), np.zeros((l, n))],
+    ])  # fmt: skip
+    predicted_free = free[1:].ravel()
+    bounds = np.concatenate([
+        np.tile(limits.u_max - u_previous, n_c), np.tile(u_previous - limits.u_min, n_c),
+        np.tile(limits.du_max, 2 * n_c),
+        np.tile(limits.y_max, n_p) - predicted_free, predicted_free - np.tile(limits.y_min, n_p), np.zeros(l),
+    ])  # fmt: skip
+    limited = np.isfinite(bounds)
+    return Program(H, f, float(error @ Q @ error), rows[limited], bounds[limited])
+
+
+def best_on(program, pattern, n_violations, at_least=None, at_most=None):
+    """The least cost with moves on a pattern (n_moves,) alone, price aside; infinite where there is none.
+
+    `at_least` and `at_most`, (n_moves,), bound the moves of the pattern further.
+    """
+    kept = np.concatenate([np.ones(n_violations, dtype=bool), pattern])
+    rows, bounds = [program.rows[:, kept]], [program.bounds]
+    for sign, limit in ((-1.0, at_least), (1.0, at_most)):
+        if limit is not None and np.isfinite(limit[pattern]).any():
+            unit = sign * np.eye(len(kept))[n_violations:][pattern][:, kept]
+            finite = np.isfinite(limit[pattern])
+            rows.append(unit[finite])
+            bounds.append(sign * limit[pattern][finite])
+    A, b = np.vstack(rows), np.concatenate(bounds)
+    idle = ~A.any(axis=1)
+    if (b[idle] < -1e-12).any():
+        return np.inf
+    A, b = A[~idle], b[~idle]
+    H, f = program.H[np.ix_(kept, kept)], program.f[kept]
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    settings.max_threads = 1
+    for settings.equilibrate_enable in (True, False):  # either way a few of our programs do not converge
+        cones = [clarabel.NonnegativeConeT(len(b))]
+        P, C = sparse.csc_matrix(np.triu(H)), sparse.csc_matrix(A)
+        solution = clarabel.DefaultSolver(P, f, C, b, cones, settings).solve()
+        if solution.status == clarabel.SolverStatus.PrimalInfeasible:
+            return np.inf
+        if solution.status == clarabel.SolverStatus.Solved:
+            return program.constant + solution.obj_val
+    raise AssertionError(f"clarabel: {solution.status}")
+
+
+def best_on_every_pattern(problem, rules, x, u_previous, reference):
+    """The least cost, price aside, on every pattern of `all_patterns`, least sizes kept by trying all signs."""
+    program = program_of(problem, x, u_previous, reference)
+    n_c, m, v = problem.control_horizon, problem.model.n_inputs, problem.model.n_outputs
+    size = np.tile(np.broadcast_to(rules.min_size, m), n_c)
+    values = []
+    for pattern in all_patterns(n_c, m):
+        sized = np.flatnonzero(pattern.ravel() & (size > 0))
+        best = np.inf
+        for signs in product((-1, 1), repeat=len(sized)):
+            at_least, at_most = np.full(n_c * m, -np.inf), np.full(n_c * m, np.inf)
+            for i, sign in zip(sized, signs, strict=True):
+                (at_least if sign > 0 else at_most)[i] = sign * size[i]
+            best = min(best, best_on(program, pattern.ravel(), v, at_least, at_most))
+        values.append(best)
+    return np.array(values)
+
+
+def objective_of(problem, rules, x, past, reference, plan):
+    """The objective of planned inputs by simulation, price included."""
+    return cost_of(problem, x, past[-1], reference, plan) + charge(rules, moved(np.vstack([past[-1:], plan])))

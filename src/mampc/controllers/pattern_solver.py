@@ -10,7 +10,7 @@ import numpy as np
 
 from mampc.arrays import Array, BoolArray
 from mampc.condensing import CondensedQP, Instance, Restriction
-from mampc.patterns import Admissible
+from mampc.patterns import SAME, Admissible
 from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver
 
@@ -124,6 +124,9 @@ class PatternSolver:
             )
         moves = np.zeros(n)
         moves[pattern] = best
+        if len(best) and np.abs(best).min() < SMALLER:
+            moves = self._without_rounding(instance, moves)
+            least += self.admissible.charge(moves != 0) - self.admissible.charge(pattern)
         return OnPattern(moves, least, status, multipliers, iterations)
 
     def offer(
@@ -154,6 +157,16 @@ class PatternSolver:
         if not inside or (self.admissible.sized and (np.abs(d) < self.admissible.min_size[chosen]).any()):
             return None
         return moves
+
+    def _without_rounding(self, instance: Instance, moves: Array) -> Array:
+        """The moves with inputs exactly within their limits, and changes too small to count exactly zero."""
+        limits, u = self.condensed.problem.limits, instance.u_previous
+        changes = moves.reshape(-1, len(u)).copy()
+        wanted = np.clip(u + changes.cumsum(axis=0), limits.u_min, limits.u_max)
+        for change, level in zip(changes, wanted, strict=True):
+            change[:] = np.where(np.abs(level - u) > SAME, level - u, 0.0)
+            u = u + change
+        return changes.ravel()
 
     def _solver(self, pattern: BoolArray) -> tuple[Restriction, DaqpSolver]:
         key = pattern.tobytes()
