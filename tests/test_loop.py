@@ -129,12 +129,15 @@ def test_moves_are_counted_and_limited_from_the_inputs_that_were_really_applied(
     np.testing.assert_array_equal(moved.state.controller.inputs[0], elsewhere)
 
 
-@pytest.mark.parametrize("unknown", [[np.nan, 1.0], [np.inf, 1.0], [-np.inf, np.nan]])
+@pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf, 1e300])
 def test_applied_inputs_that_are_not_known_are_taken_to_be_those_decided(unknown):
     model = stable_model()
     loop = regulator(model)
     arguments = loop.initial_state(), model.y_op + 0.1, model.y_op
-    assert same_decision(loop.step(*arguments, u_applied=unknown), loop.step(*arguments))
+    assert same_decision(loop.step(*arguments, u_applied=[unknown] * 2), loop.step(*arguments))
+    assert same_decision(
+        loop.step(*arguments, u_applied=[unknown, 1.0]), loop.step(*arguments, u_applied=[model.u_op[0], 1.0])
+    )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
@@ -146,7 +149,7 @@ def test_a_bad_measurement_holds_the_inputs_and_the_loop_recovers(bad):
     for k in range(120):
         y = model.y_op + model.C @ x + model.D @ (u - model.u_op)
         spoiled = 3 <= k < 6
-        decision = loop.step(state, [y[0], bad] if spoiled else y, reference)
+        decision = loop.step(state, [bad, bad] if spoiled else y, reference)
         if spoiled:
             assert decision.status is Status.HELD_BAD_MEASUREMENT
             np.testing.assert_array_equal(decision.u, u)

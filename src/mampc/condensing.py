@@ -28,107 +28,11 @@ import numpy as np
 
 from mampc.arrays import Array, BoolArray, ComplexArray, as_shaped
 from mampc.errors import MampcError
+from mampc.instance import Instance, Parts, PatternOptimum
 from mampc.problem import TrackingProblem
 from mampc.qp import UNBOUNDED, QuadraticProgram
 
 LARGEST_RESPONSE = 1e100  # per unit of state or input; its square is still a number
-
-
-class Parts(NamedTuple):
-    """Where each quantity stands in the data of an optimum or an instance."""
-
-    margins: slice
-    moves: slice
-    inputs: slice
-    residual: slice
-    f: slice = slice(0)
-    f_moves: slice = slice(0)
-    error: slice = slice(0)
-    lower: slice = slice(0)
-    upper: slice = slice(0)
-
-
-class Optimum:
-    """One sample's optimum without limits on some pattern, as views into one array.
-
-    How far it stays from each bound (negative where it breaks one), its moves d, its inputs
-    u_0 .. u_{nc-1}, and a vector whose squared length is its cost.
-    """
-
-    __slots__ = ("data", "parts")
-
-    def __init__(self, data: Array, parts: Parts) -> None:
-        self.data, self.parts = data, parts
-
-    @property
-    def margins(self) -> Array:
-        return self.data[self.parts.margins]
-
-    @property
-    def moves(self) -> Array:
-        return self.data[self.parts.moves]
-
-    @property
-    def inputs(self) -> Array:
-        return self.data[self.parts.inputs]
-
-    @property
-    def cost(self) -> float:
-        residual = self.data[self.parts.residual]
-        return float(residual.dot(residual))
-
-
-class Instance(Optimum):
-    """One sample's data; symbols as in the module's docstring. As an `Optimum`: that with every move free."""
-
-    __slots__ = ("parameter", "u_previous")
-
-    def __init__(self, data: Array, parts: Parts, parameter: Array, u_previous: Array) -> None:
-        self.data, self.parts = data, parts
-        self.parameter, self.u_previous = parameter, u_previous
-
-    @property
-    def f(self) -> Array:
-        """Linear term of the program, shape (n_variables,)."""
-        return self.data[self.parts.f]
-
-    @property
-    def f_moves(self) -> Array:
-        """Its entries for the moves, shape (n_moves,)."""
-        return self.data[self.parts.f_moves]
-
-    @property
-    def error(self) -> Array:
-        """Q^(1/2) (r - free), and the weighted tail, shape (n_errors,)."""
-        return self.data[self.parts.error]
-
-    @property
-    def constant(self) -> float:
-        """The cost of no moves: |error|^2."""
-        error = self.data[self.parts.error]
-        return float(error.dot(error))
-
-    @property
-    def lower(self) -> Array:
-        """Lower bounds of the program, shape (n_bounds,)."""
-        return self.data[self.parts.lower]
-
-    @property
-    def upper(self) -> Array:
-        """Upper bounds of the program, shape (n_bounds,)."""
-        return self.data[self.parts.upper]
-
-
-class PatternOptimum:
-    """The optimum without limits on one pattern, ready to be evaluated sample by sample."""
-
-    def __init__(self, preview_map: Array, constant_map: Array, parts: Parts) -> None:
-        self._maps, self.parts = {m.shape[1]: m for m in (preview_map, constant_map)}, parts
-
-    def at(self, instance: Instance) -> Optimum:
-        """Its values for one sample; margins belong to the bounds that `CondensedQP.restricted` keeps."""
-        parameter = instance.parameter
-        return Optimum(self._maps[len(parameter)].dot(parameter), self.parts)
 
 
 class Restriction(NamedTuple):
@@ -151,6 +55,11 @@ class CondensedQP:
         error_of_reference: what a constant reference adds to the error, shape (n_errors, l).
         map_bytes: about the memory that an `optimum_on` some pattern takes.
         violation_scale: sqrt(q) of `TrackingProblem`, per output, shape (l,).
+        moves_bounded: whether every move has a simple bound; if not, the first inputs have.
+        input_rows: where the rows of the inputs stand among the bounds, a slice.
+        move_of_bound: the move that makes an input row new, -1 for other bounds, shape (n_bounds,).
+        above, below: rows of theta that y_max and y_min bound.
+        above_rows, below_rows: where they stand among the bounds.
 
     Args:
         problem: what to condense.
@@ -165,7 +74,7 @@ class CondensedQP:
         self.problem = problem
         # With move limits every move has a simple bound and every input a row; without, the first inputs'
         # limits are simple bounds of the first moves.
-        self._moves_bounded = bound_every_move or bool(np.isfinite(problem.limits.du_max).any())
+        self.moves_bounded = bound_every_move or bool(np.isfinite(problem.limits.du_max).any())
         model, n_p, n_c = problem.model, problem.prediction_horizon, problem.control_horizon
         m, l = model.n_inputs, model.n_outputs
         self.n_moves = n_c * m
@@ -237,14 +146,16 @@ class CondensedQP:
         m, l, n_c, n = problem.model.n_inputs, problem.model.n_outputs, problem.control_horizon, self.n_moves
         limited = np.isfinite(limits.y_min) | np.isfinite(limits.y_max)
         self.n_violations = v = int(limited.sum())
-        n_simple = v + (n if self._moves_bounded else m)
-        skipped = 0 if self._moves_bounded else m
+        n_simple = v + (n if self.moves_bounded else m)
+        skipped = 0 if self.moves_bounded else m
         inputs = np.flatnonzero(np.tile(np.isfinite(limits.u_min) | np.isfinite(limits.u_max), n_c))
         inputs = inputs[inputs >= skipped]
         # theta d - e <= y_max - free and theta d + e >= y_min - free at i = 1..np, e that output's violation.
         predicted = np.arange(l, len(self.theta))
-        self._above = predicted[np.isfinite(limits.y_max)[predicted % l]]
-        self._below = predicted[np.isfinite(limits.y_min)[predicted % l]]
+        self.above = predicted[np.isfinite(limits.y_max)[predicted % l]]
+        self.below = predicted[np.isfinite(limits.y_min)[predicted % l]]
+        self._above_outputs = np.flatnonzero(np.isfinite(limits.y_max))
+        self._below_outputs = np.flatnonzero(np.isfinite(limits.y_min))
         tracking = np.abs(np.diag(problem.output_weight))
         reach = np.abs(self.theta.reshape(-1, l, n)).max(axis=(0, 2))
         moving = np.abs(problem.move_weight).max() / np.maximum(reach, 1e-6) ** 2
@@ -254,8 +165,8 @@ class CondensedQP:
         A = np.block(
             [
                 [np.zeros((len(inputs), v)), self.cumulate[inputs]],
-                [-violation[self._above % l], self.theta[self._above]],
-                [violation[self._below % l], self.theta[self._below]],
+                [-violation[self.above % l], self.theta[self.above]],
+                [violation[self.below % l], self.theta[self.below]],
             ]
         )
         H = np.block(
@@ -263,29 +174,30 @@ class CondensedQP:
         )
         self.program = QuadraticProgram(H, A, n_simple)
         self.bounded_rows = np.vstack([np.eye(n_simple - v, n), A[:, v:]])
-        self._move_of_bound = np.full(n_simple + len(A), -1)  # the move that makes an input row new, else -1
-        self._move_of_bound[n_simple : n_simple + len(inputs)] = inputs
-        self._above_rows = n_simple + len(inputs) + np.arange(len(self._above))
-        self._below_rows = self._above_rows.size + n_simple + len(inputs) + np.arange(len(self._below))
+        self.move_of_bound = np.full(n_simple + len(A), -1)  # the move that makes an input row new, else -1
+        self.input_rows = slice(n_simple, n_simple + len(inputs))
+        self.move_of_bound[self.input_rows] = inputs
+        self.above_rows = n_simple + len(inputs) + np.arange(len(self.above))
+        self.below_rows = self.above_rows.size + n_simple + len(inputs) + np.arange(len(self.below))
 
         lower, one = np.zeros((n_simple + len(A), free.shape[1])), self._one_at
         lower[:, one] = -UNBOUNDED
         upper = -lower
         lower[:v, one] = 0.0
         u_min, u_max = np.maximum(limits.u_min, -UNBOUNDED), np.minimum(limits.u_max, UNBOUNDED)
-        if self._moves_bounded:
+        if self.moves_bounded:
             upper[v:n_simple, one] = np.tile(np.minimum(limits.du_max, UNBOUNDED), n_c)
             lower[v:n_simple, one] = -upper[v:n_simple, one]
         else:
             lower[v:n_simple], upper[v:n_simple] = -u_previous, -u_previous
             lower[v:n_simple, one], upper[v:n_simple, one] = u_min, u_max
-        of_inputs = slice(n_simple, n_simple + len(inputs))
-        lower[of_inputs], upper[of_inputs] = -u_previous[inputs % m], -u_previous[inputs % m]
-        lower[of_inputs, one], upper[of_inputs, one] = u_min[inputs % m], u_max[inputs % m]
-        upper[self._above_rows] = -free[self._above]
-        upper[self._above_rows, one] += limits.y_max[self._above % l]
-        lower[self._below_rows] = -free[self._below]
-        lower[self._below_rows, one] += limits.y_min[self._below % l]
+        rows = self.input_rows
+        lower[rows], upper[rows] = -u_previous[inputs % m], -u_previous[inputs % m]
+        lower[rows, one], upper[rows, one] = u_min[inputs % m], u_max[inputs % m]
+        upper[self.above_rows] = -free[self.above]
+        upper[self.above_rows, one] += limits.y_max[self.above % l]
+        lower[self.below_rows] = -free[self.below]
+        lower[self.below_rows, one] += limits.y_min[self.below % l]
         return lower, upper
 
     def _tail(self, powers: Array, n_parameters: int) -> tuple[Array, Array]:
@@ -394,10 +306,10 @@ class CondensedQP:
             v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
         return np.concatenate((x, u_previous, d_u, d_y, v, one, reference))
 
-    def instance(self, parameter: Array, u_previous: Array) -> Instance:
-        """The data of one sample, from its `parameter`."""
+    def instance(self, parameter: Array, u_previous: Array, manual: BoolArray | None = None) -> Instance:
+        """The data of one sample, from its `parameter`; inputs in `manual`, shape (m,), may not move."""
         maps = self._constant_map if len(parameter) == self._constant_map.shape[1] else self._preview_map
-        return Instance(maps.dot(parameter), self.parts, parameter, u_previous)
+        return Instance(maps.dot(parameter), self.parts, parameter, u_previous, manual)
 
     def cost(self, instance: Instance, moves: Array) -> float:
         """Tracking cost plus move weights plus output-limit penalty of the moves d, shape (n_moves,)."""
@@ -412,10 +324,13 @@ class CondensedQP:
         """Largest predicted excess over its limits of each output over i = 1..np, shape (l,)."""
         l = self.problem.model.n_outputs
         excess = np.zeros(l)
-        above = self.theta[self._above] @ moves - instance.upper[self._above_rows]
-        below = instance.lower[self._below_rows] - self.theta[self._below] @ moves
-        np.maximum.at(excess, self._above % l, above)
-        np.maximum.at(excess, self._below % l, below)
+        above = self.theta[self.above] @ moves - instance.upper[self.above_rows]
+        below = instance.lower[self.below_rows] - self.theta[self.below] @ moves
+        # Rows come sample by sample, each with the same outputs.
+        for over, outputs in ((above, self._above_outputs), (below, self._below_outputs)):
+            if len(over):
+                largest = over.reshape(-1, len(outputs)).max(axis=0)
+                excess[outputs] = np.maximum(excess[outputs], largest)
         return excess
 
     def relaxed_limits(self, instance: Instance, multipliers: Array) -> tuple[Array, float]:
@@ -445,7 +360,7 @@ class CondensedQP:
         v, full = self.n_violations, self.program
         kept = np.concatenate([np.ones(v, dtype=bool), pattern])
         columns = np.flatnonzero(kept)
-        move = self._move_of_bound
+        move = self.move_of_bound
         bound_kept = np.where(move < 0, True, pattern[np.maximum(move, 0)])
         bound_kept[: full.n_simple] = kept[: full.n_simple]
         bounds = np.flatnonzero(bound_kept)

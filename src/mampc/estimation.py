@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array, as_vector
+from mampc.arrays import Array, BoolArray, as_vector
 from mampc.errors import MampcError
 from mampc.lti import StateSpace
 
@@ -28,16 +28,23 @@ class Estimate:
 class KalmanFilter:
     """A stationary Kalman filter for a model augmented with one integrating disturbance per output.
 
-    Build it with `offset_free`.
+    Build it with `offset_free`. Outputs that are missing drop out of the correction: those that are left
+    correct with the gain that the same covariances give them, no larger than in every-day operation, so that
+    the return of a measurement makes no jump beyond what it justifies.
 
     Args:
         model: the discrete model.
         directions: how the l disturbances act: (m, l) at the inputs, or None for at the outputs.
-        gain: from innovation to state and disturbances, shape (n + l, l).
+        covariance: of the predicted state and disturbances, stationary, shape (n + l, n + l).
+        noise: covariance of the measurement noise, shape (l, l).
     """
 
-    def __init__(self, model: StateSpace, directions: Array | None, gain: Array) -> None:
-        self.model, self.directions, self.gain = model, directions, gain
+    def __init__(self, model: StateSpace, directions: Array | None, covariance: Array, noise: Array) -> None:
+        self.model, self.directions = model, directions
+        self._covariance, self._noise = covariance, noise
+        self._A, self._C = _augmented(model, directions)
+        self._gains: dict[bytes, Array] = {}
+        self.gain = self.gain_with(np.ones(model.n_outputs, dtype=bool))
 
     @classmethod
     def offset_free(
@@ -79,7 +86,7 @@ class KalmanFilter:
         at_output = disturbance == "output"
         if not at_output and m < l:
             raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")
-        response = _response(model)
+        response = static_response(model)
         size = float(np.sqrt(np.mean(response**2))) or 1.0
         directions = None if at_output else np.eye(m) if m == l else response.T / (size * np.sqrt(l))
         A, C = _augmented(model, directions)
@@ -100,8 +107,28 @@ class KalmanFilter:
             raise MampcError(
                 f"offset_free: expected a detectable model, the Riccati equation failed: {error}"
             ) from None
-        gain = np.linalg.solve(C @ P @ C.T + R, C @ P).T
-        return cls(model, directions, gain)
+        return cls(model, directions, P, R)
+
+    def gain_with(self, believed: BoolArray) -> Array:
+        """From innovation to state and disturbances, shape (n + l, l), where only some outputs count.
+
+        Columns of the others are zero. Should the rest be too little to keep the estimate from running
+        away, nothing is corrected.
+        """
+        key = believed.tobytes()
+        gain = self._gains.get(key)
+        if gain is None:
+            C, P = self._C[believed], self._covariance
+            gain = np.zeros((len(P), len(believed)))
+            gain[:, believed] = np.linalg.solve(
+                C @ P @ C.T + self._noise[np.ix_(believed, believed)], C @ P
+            ).T
+            error = self._A - gain @ self._C @ self._A
+            allowed = max(1.0, float(np.max(np.abs(np.linalg.eigvals(self.model.A)), initial=0.0)))
+            if not np.max(np.abs(np.linalg.eigvals(error))) <= allowed + 1e-9:
+                gain = np.zeros_like(gain)
+            self._gains[key] = gain
+        return gain
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> Estimate:
         """At rest under inputs u (m,) and measured disturbances v (d,), default those of the operating
@@ -125,11 +152,27 @@ class KalmanFilter:
         x = self.model.A @ last.x + self.model.B @ self._change(last, u, v)
         return Estimate(x, last.output_disturbance, last.input_disturbance)
 
-    def correct(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Estimate:
-        """Correct with measurements y (l,), taken just before the inputs u (m,) are replaced and while the
-        measured disturbances are v (d,).
+    def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
+        """Measured less predicted outputs, shape (l,).
+
+        The measurements y (l,) are taken just before the inputs u (m,) are replaced and while the measured
+        disturbances are v (d,).
         """
-        correction = self.gain @ (y - self._output(predicted, self._change(predicted, u, v)))
+        innovation: Array = y - self._output(predicted, self._change(predicted, u, v))
+        return innovation
+
+    def correct(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Estimate:
+        """Correct with measurements y (l,), taken as `innovation` says."""
+        return self.corrected(predicted, self.innovation(predicted, u, y, v))
+
+    def corrected(
+        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
+    ) -> Estimate:
+        """Correct with the innovation (l,), of which only the outputs `believed` count (default all)."""
+        gain = self.gain
+        if believed is not None:
+            gain, innovation = self.gain_with(believed), np.where(believed, innovation, 0.0)
+        correction = gain @ innovation
         n = self.model.n_states
         return self._disturbed(replace(predicted, x=predicted.x + correction[:n]), correction[n:])
 
@@ -177,7 +220,7 @@ def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
                 )
 
 
-def _response(model: StateSpace) -> Array:
+def static_response(model: StateSpace) -> Array:
     """Output changes per unit of input, shape (l, m): at rest, or after 10 samples where none comes."""
     try:
         gain = model.dc_gain()

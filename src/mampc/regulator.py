@@ -1,50 +1,74 @@
-"""The regulator: estimator and controller behind one pure step from measurements to inputs."""
+"""The regulator: sensor checks, estimator and controller behind one pure step from measurements to inputs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import json
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array, as_shaped, as_vector, is_usable
+from mampc.arrays import LARGEST, Array, as_shaped, as_vector, as_whole, is_usable
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.errors import MampcError
 from mampc.estimation import Estimate, KalmanFilter
 from mampc.lti import StateSpace
+from mampc.problem import Limits
+from mampc.sensors import SensorChecks, SensorState
+
+FORMAT = "mampc-regulator-state-1"
 
 
 @dataclass(frozen=True, eq=False)
 class RegulatorState:
-    """What a regulator remembers between samples."""
+    """What a regulator remembers between samples; plain numbers, which JSON carries exactly."""
 
     controller: ControllerState
     estimate: Estimate
     measured_disturbance: Array  # shape (d,), as last told
+    sensors: SensorState
+
+    def to_json(self) -> str:
+        """The state as JSON text; `Regulator.state_from_json` gives the same numbers back, to the last bit."""
+        return json.dumps({"format": FORMAT, **asdict(self)}, default=np.ndarray.tolist)
 
 
 class Regulator:
-    """Output feedback: a controller fed by an estimator.
+    """Output feedback: a controller fed by an estimator, which believes what passes the sensor checks.
 
     Args:
         controller: `MPC` or `MAMPC`.
         estimator: default `KalmanFilter.offset_free` of the controller's model.
+        sensors: when a measurement is believed; default `SensorChecks()`.
+        max_blind_steps: samples in a row that inputs are still planned, on predictions, though no output at
+            all is believed; from then on they are held until one is. 0 holds at once.
 
     Raises:
         MampcError: arguments of other types, or an estimator of a model of other dimensions.
     """
 
-    def __init__(self, controller: Controller, estimator: KalmanFilter | None = None) -> None:
+    def __init__(
+        self,
+        controller: Controller,
+        estimator: KalmanFilter | None = None,
+        *,
+        sensors: SensorChecks | None = None,
+        max_blind_steps: int = 0,
+    ) -> None:
         if not isinstance(controller, Controller):
             raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
         if not isinstance(estimator, KalmanFilter | None):
             raise MampcError(f"estimator: expected a KalmanFilter, received {type(estimator).__name__}")
+        if not isinstance(sensors, SensorChecks | None):
+            raise MampcError(f"sensors: expected SensorChecks, received {type(sensors).__name__}")
         model = controller.problem.model
         self.controller = controller
+        self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
         self._y_shape = (model.n_outputs,)
         self.estimator = KalmanFilter.offset_free(model) if estimator is None else estimator
+        self._sensors = (SensorChecks() if sensors is None else sensors).fitted(controller.problem)
         self._v_shape = (model.n_disturbances,)
         expected, received = _sizes(model), _sizes(self.estimator.model)
         if received != expected:
@@ -68,7 +92,32 @@ class Regulator:
         v = self.controller.problem.model.v_op
         if measured_disturbance is not None:
             v = as_vector("measured_disturbance", measured_disturbance, len(v))
-        return RegulatorState(controller, self.estimator.initial(controller.inputs[-1], y, v), v)
+        estimate = self.estimator.initial(controller.inputs[-1], y, v)
+        return RegulatorState(controller, estimate, v, self._sensors.initial())
+
+    def state_from_json(self, text: str) -> RegulatorState:
+        """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
+        try:
+            content = json.loads(text)
+            if content.pop("format") != FORMAT:
+                raise MampcError(f"state: expected the format {FORMAT!r}")
+            numbers = {part: _numbers(values) for part, values in content.items()}
+            state = RegulatorState(
+                ControllerState(**numbers["controller"]),
+                Estimate(**numbers["estimate"]),
+                numbers["measured_disturbance"],
+                SensorState(**numbers["sensors"]),
+            )
+            received, expected = _shapes(state), _shapes(self.initial_state())
+        except MampcError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            raise MampcError(
+                f"state: expected what RegulatorState.to_json writes, received: {error!r}"
+            ) from None
+        if received != expected:
+            raise MampcError(f"state: expected one of this regulator ({expected}), received {received}")
+        return state
 
     def step(
         self,
@@ -78,56 +127,103 @@ class Regulator:
         *,
         u_applied: Any = None,
         measured_disturbance: Any = None,
+        limits: Limits | None = None,
+        manual: Any = None,
     ) -> Decision:
         """Decide the inputs of this sample from its measurements.
 
         Args:
             state: from `initial_state` or the previous decision.
-            y: measured outputs, shape (l,); numbers that are not usable lead to a held input.
+            y: measured outputs, shape (l,). Those not believed (not-a-number, masked, or refused by the sensor
+                checks) do not correct the estimate; `decision.ignored_outputs` names them. With none left the
+                inputs are held (see `max_blind_steps`).
             reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
-            u_applied: what the plant really got since the last step, shape (m,), if not what was decided.
+            u_applied: what the plant really got since the last step, shape (m,), if not what was decided:
+                a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided.
             measured_disturbance: now, shape (d,), in engineering units; predicted to stay as it is.
                 Left out or not usable, the last one holds on.
+            limits, manual: see `Controller.step`. Tell `u_applied` while an input is in manual; when it is
+                back in automatic, the first plan starts from there.
 
         Raises:
             MampcError: arguments that are no numbers or of the wrong shape.
         """
         start = perf_counter()
-        y = as_shaped("y", y, self._y_shape)
+        y = as_shaped("y", _unmasked(y), self._y_shape)
         memory, v_last = state.controller, state.measured_disturbance
         if u_applied is not None:
             memory = self._applied(memory, u_applied)
         v = v_last
         if measured_disturbance is not None:
-            told = as_shaped("measured_disturbance", measured_disturbance, self._v_shape)
-            v = told if len(told) and is_usable(told) else v_last
+            v = _where_usable(as_shaped("measured_disturbance", measured_disturbance, self._v_shape), v_last)
         u_previous = memory.inputs[-1]
-        estimate = self.estimator.predict(state.estimate, u_previous, v_last)
-        usable = is_usable(y)
-        if not is_usable(estimate.x):  # it ran away without measurements: start again
-            estimate = self.estimator.initial(u_previous, y if usable else None, v_last)
-        if usable:
-            estimate = self.estimator.correct(estimate, u_previous, y, v)  # y shows v at once, u later
+        estimator, last = self.estimator, state.estimate
+        estimate = estimator.predict(last, u_previous, v_last)
+        if not (
+            is_usable(estimate.x) and is_usable(estimate.output_disturbance + last.input_disturbance.sum())
+        ):
+            # It ran away without measurements: start again.
+            last = estimate = estimator.initial(u_previous, y if is_usable(y) else None, v_last)
+        # Measurements show v at once and u later.
+        innovation = estimator.innovation(estimate, u_previous, y, v)
+        movement = estimator.model.C @ (estimate.x - last.x)
+        believed, ignored, sensors = self._sensors.check(state.sensors, y, innovation, movement)
+        if not ignored:
+            estimate = estimator.corrected(estimate, innovation)
+        elif believed.any():
+            estimate = estimator.corrected(estimate, innovation, believed)
+        blind = sensors.blind > self.max_blind_steps
         decision = self.controller.step(
             memory,
-            estimate.x if usable else np.full_like(estimate.x, np.nan),  # without a measurement: hold
+            np.full_like(estimate.x, np.nan) if blind else estimate.x,  # not-a-number: hold
             reference,
             output_disturbance=estimate.output_disturbance,
             input_disturbance=estimate.input_disturbance,
             measured_disturbance=v,
+            limits=limits,
+            manual=manual,
         )
         return replace(
             decision,
-            state=RegulatorState(decision.state, estimate, v),
+            state=RegulatorState(decision.state, estimate, v, sensors),
+            ignored_outputs=ignored,
             solve_time=perf_counter() - start,
         )
 
     def _applied(self, memory: ControllerState, u_applied: Any) -> ControllerState:
         """The memory with the latest inputs put right; not-usable numbers change nothing."""
-        u = as_shaped("u_applied", u_applied, memory.inputs[-1].shape)
-        if not is_usable(u):
-            return memory
+        decided = memory.inputs[-1]
+        u = _where_usable(as_shaped("u_applied", _unmasked(u_applied), decided.shape), decided)
         return replace(memory, inputs=np.concatenate([memory.inputs[:-1], u[None]]))
+
+
+def _unmasked(values: Any) -> Any:
+    """Masked entries as not-a-number."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.float64), np.nan)
+    return values
+
+
+def _where_usable(told: Array, otherwise: Array) -> Array:
+    """The numbers told, and the others where they are not usable."""
+    return np.where((told > -LARGEST) & (told < LARGEST), told, otherwise)
+
+
+def _numbers(value: Any) -> Any:
+    """Lists of numbers as arrays; dictionaries entry by entry; numbers and None as they are."""
+    if isinstance(value, dict):
+        return {name: _numbers(entry) for name, entry in value.items()}
+    return np.array(value, dtype=np.float64) if isinstance(value, list) else value
+
+
+def _shapes(state: RegulatorState) -> dict[str, Any]:
+    """The shape of every array of a state, by its place."""
+    return {
+        f"{part}.{name}": np.shape(value)
+        for part, content in asdict(state).items()
+        for name, value in (content.items() if isinstance(content, dict) else [("value", content)])
+        if name != "guess"
+    }
 
 
 def _sizes(model: StateSpace) -> str:

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.arrays import Array, as_number, as_whole
-from mampc.condensing import CondensedQP, Instance
+from mampc.condensing import CondensedQP
 from mampc.controllers.alternating import FirstStep
 from mampc.controllers.heuristic import Heuristic, HeuristicSearch
 from mampc.controllers.pattern_solver import Incumbent
+from mampc.instance import Instance
 from mampc.patterns import MoveRules, Past
 from mampc.qp import QPStatus
 

@@ -23,11 +23,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.arrays import Array, BoolArray, as_number, as_whole
-from mampc.condensing import CondensedQP, Instance
+from mampc.condensing import CondensedQP
 from mampc.controllers.controller import HELD_BY, Plan
 from mampc.controllers.decision import ControllerState, Status
 from mampc.controllers.heuristic import Heuristic, HeuristicSearch
 from mampc.controllers.pattern_solver import Incumbent
+from mampc.instance import Instance
 from mampc.patterns import MoveRules, Past
 from mampc.qp import QPStatus, QuadraticProgram
 from mampc.qp_daqp import DaqpSolver
@@ -80,7 +81,7 @@ class AlternatingSearch(HeuristicSearch):
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """Algorithm 1 for one sample, from the guess that the last sample left (at first: v = 0)."""
-        past = self.admissible.past(state.inputs)
+        past = self.admissible.past(state.inputs, instance.manual)
         v = np.zeros(self.condensed.n_moves) if state.guess is None else state.guess.ravel()
         choose = self._second_step(state, past)
         settled = alternate(
@@ -93,7 +94,7 @@ class AlternatingSearch(HeuristicSearch):
         else:
             status = Status.FEASIBLE if self.settings.polish else Status.SETTLED
         guess = self._shifted(settled.v)
-        if not self.settings.polish:
+        if not self.settings.polish and instance.manual is None:  # in manual, no move is a small one
             plan = Plan(settled.d, status, settled.rounds, guess=guess, remarks=self._remarks(past))
             return self._certified(plan, instance, state)
         pattern = settled.v != 0.0

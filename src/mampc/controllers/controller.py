@@ -9,11 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.arrays import LARGEST, Array, as_array, as_shaped, as_vector, is_usable
-from mampc.condensing import CondensedQP, Instance
+from mampc.arrays import LARGEST, Array, BoolArray, as_array, as_shaped, as_vector, is_usable
+from mampc.condensing import CondensedQP
 from mampc.controllers.decision import ControllerState, Decision, Remark, Status
+from mampc.controllers.pattern_solver import PatternSolver
+from mampc.controllers.present import PresentLimits
 from mampc.errors import MampcError
-from mampc.problem import TrackingProblem
+from mampc.instance import Instance
+from mampc.patterns import MoveRules
+from mampc.problem import Limits, TrackingProblem
 from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver
 
@@ -51,19 +55,28 @@ class Controller(ABC):
 
     Args:
         problem: what to track, over which horizons, at what weights and within what limits.
+        time_limit: seconds that one quadratic program may take; None for no limit.
     """
 
-    def __init__(self, problem: TrackingProblem, *, bound_every_move: bool = False) -> None:
+    def __init__(
+        self, problem: TrackingProblem, *, time_limit: float | None = None, bound_every_move: bool = False
+    ) -> None:
         if not isinstance(problem, TrackingProblem):
             raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
         self.problem = problem
         self.condensed = CondensedQP(problem, bound_every_move=bound_every_move)
-        self._solver = DaqpSolver(self.condensed.program)
+        self._solver = DaqpSolver(self.condensed.program, time_limit=time_limit)
+        self._in_manual: PatternSolver | None = None  # plain MPC while some inputs are in manual
         limits, model = problem.limits, problem.model
         # Without limits of their own inputs still stay within what counts as a number.
         self._u_min = np.maximum(limits.u_min, -LARGEST / 2)
         self._u_max = np.minimum(limits.u_max, LARGEST / 2)
         self._u_range = list(zip(self._u_min.tolist(), self._u_max.tolist(), strict=True))
+        self._du_max = limits.du_max if np.isfinite(limits.du_max).any() else None
+        self._no_violations = np.zeros(model.n_outputs)
+        self._unknown_violations = np.full(model.n_outputs, np.nan)
+        for constant in (self._no_violations, self._unknown_violations):
+            constant.setflags(write=False)
         self._shape = (problem.control_horizon, model.n_inputs)
         self._x_shape = (model.n_states,)
         self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
@@ -99,6 +112,8 @@ class Controller(ABC):
         output_disturbance: Array | None = None,
         input_disturbance: Array | None = None,
         measured_disturbance: Array | None = None,
+        limits: Limits | None = None,
+        manual: Any = None,
     ) -> Decision:
         """Decide the inputs of this sample.
 
@@ -110,6 +125,10 @@ class Controller(ABC):
             input_disturbance: added to every input of the model, shape (m,).
             measured_disturbance: the model's measured disturbances, taken to stay as they are, in
                 engineering units, shape (d,); default those of the operating point.
+            limits: of this sample, for signals that have such a limit in the problem: each None, a scalar, one
+                value per signal, or one row per sample, (nc, m) for inputs and moves, (np, l) for outputs at
+                i = 1..np. Inputs stay within the limits of the problem too, outputs have these instead.
+            manual: which inputs somebody else moves now, bool, shape (m,); they are planned to stay as they are.
 
         Returns:
             A `Decision`. Numbers that `is_usable` refuses lead to a held input and a status, not to an error.
@@ -121,7 +140,9 @@ class Controller(ABC):
         x = as_shaped("x", x, self._x_shape)
         constant, previewed = self._reference_shapes
         reference = as_shaped("reference", reference, constant if np.ndim(reference) == 1 else previewed)
-        planned_from = self._planned_from(state)
+        present = None if limits is None else PresentLimits(limits, self.condensed)
+        held_by_hand = None if manual is None else self._manual(manual)
+        planned_from = self._planned_from(state, present)
         while True:
             u_previous = planned_from.inputs[-1]
             parameter = self.condensed.parameter(
@@ -129,24 +150,45 @@ class Controller(ABC):
             )
             if not is_usable(parameter):
                 bad = Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
-                return self._decide(bad, None, state, planned_from, start)
-            instance = self.condensed.instance(parameter, u_previous)
+                return self._decide(bad, None, state, planned_from, present, start)
+            instance = self.condensed.instance(parameter, u_previous, held_by_hand)
+            if present is not None:
+                if present.crossed:
+                    crossed = Plan(None, Status.HELD_INFEASIBLE, 0)
+                    return self._decide(crossed, instance, state, planned_from, present, start)
+                instance = present.applied_to(instance, self.condensed)
             plan = self._plan(instance, planned_from)
-            if plan.status is not Status.HELD_INFEASIBLE or planned_from is not state:
-                return self._decide(plan, instance, state, planned_from, start)
-            # Inputs outside their limits may be too far to go back within du_max: the limits come first.
-            planned_from = self._brought_inside(state)
+            if plan.status is Status.HELD_INFEASIBLE and planned_from is state:
+                # Inputs outside their limits may be too far to go back within du_max: the limits come first.
+                planned_from = self._brought_inside(state, present)
+                if planned_from is not state:
+                    continue
+            return self._decide(plan, instance, state, planned_from, present, start)
 
-    def _planned_from(self, state: ControllerState) -> ControllerState:
+    def _manual(self, manual: Any) -> BoolArray | None:
+        """Which inputs are in manual, None for no input."""
+        flags = as_shaped("manual", manual, self._shape[1:]) != 0.0
+        return flags if flags.any() else None
+
+    def _planned_from(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
         """The state that plans start from; the state itself unless a method wants another."""
         return state
 
-    def _brought_inside(self, state: ControllerState) -> ControllerState:
+    def _range(self, present: PresentLimits | None) -> tuple[Array, Array]:
+        """Least and largest inputs, shape (m,), or (nc, m) with limits of this sample."""
+        if present is None or present.crossed:
+            return self._u_min, self._u_max
+        return present.u_min, present.u_max
+
+    def _brought_inside(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
         """The state to plan from where the applied inputs are outside their limits: they go back at once.
 
         That is a move like any other, so it stands in the window of the rules as the latest one.
         """
-        inside = np.clip(state.inputs[-1:], self._u_min, self._u_max)
+        low, high = (np.atleast_2d(limit)[:1] for limit in self._range(present))
+        inside = np.minimum(np.maximum(state.inputs[-1:], low), high)
+        if (inside == state.inputs[-1:]).all():
+            return state
         kept = state.inputs[1:] if len(state.inputs) > 1 else state.inputs[:0]
         return replace(state, inputs=np.concatenate([kept, inside]))
 
@@ -164,6 +206,7 @@ class Controller(ABC):
         instance: Instance | None,
         state: ControllerState,
         planned_from: ControllerState,
+        present: PresentLimits | None,
         start: float,
     ) -> Decision:
         moves, status, iterations, lower_bound, guess, inputs, objective, remarks = plan
@@ -175,10 +218,19 @@ class Controller(ABC):
         if lower_bound is None:
             lower_bound = objective
         changes = moves.reshape(self._shape)
+        violations = self._no_violations
         if inputs is None:
+            if self._du_max is not None:
+                changes = np.minimum(np.maximum(changes, -self._du_max), self._du_max)
             # Sums in this order leave an input that does not move exactly where it was.
-            inputs = np.concatenate((planned_from.inputs[-1:], changes)).cumsum(axis=0)[1:]
-            inputs = np.minimum(np.maximum(inputs, self._u_min), self._u_max)
+            planned = np.concatenate((planned_from.inputs[-1:], changes)).cumsum(axis=0)[1:]
+            low, high = self._range(present)
+            inputs = np.minimum(np.maximum(planned, low), high)
+            if instance is None:
+                violations = self._unknown_violations
+            elif self.condensed.n_violations:
+                violations = self.condensed.violations(instance, moves)
+                violations.setflags(write=False)
         else:
             inputs = inputs.reshape(self._shape)
         if planned_from is not state:  # the way back inside the limits is part of the plan, and unproven
@@ -197,11 +249,13 @@ class Controller(ABC):
         history = inputs[:1] if len(history) == 1 else np.concatenate((history[1:], inputs[:1]))
         return Decision(
             u, inputs, changes, status, objective, lower_bound, iterations,
-            perf_counter() - start, ControllerState(history, state.samples + 1, guess), remarks,
+            perf_counter() - start, ControllerState(history, state.samples + 1, guess), remarks, violations,
         )  # fmt: skip
 
     def _unrestricted(self, instance: Instance) -> Plan:
         """Plain MPC: every move is free. Where no limit is active the optimum is at hand already."""
+        if instance.manual is not None:
+            return self._but_for_manual(instance, instance.manual)
         margins = instance.margins
         if margins[margins.argmin()] > INSIDE:
             return Plan(
@@ -212,3 +266,13 @@ class Controller(ABC):
         if solution.z is None:
             return Plan(None, HELD_BY[solution.status], solution.iterations)
         return Plan(solution.z[self.condensed.n_violations :], Status.OPTIMAL, solution.iterations, None)
+
+    def _but_for_manual(self, instance: Instance, manual: BoolArray) -> Plan:
+        """Plain MPC of the inputs that are not in manual."""
+        if self._in_manual is None:
+            m, n_c = len(manual), self.problem.control_horizon
+            self._in_manual = PatternSolver(self.condensed, MoveRules().fitted(m, n_c))
+        solved = self._in_manual.solve(instance, np.tile(~manual, self.problem.control_horizon))
+        if solved.moves is None:
+            return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.iterations)
+        return Plan(solved.moves, Status.OPTIMAL, solved.iterations, None, objective=solved.objective)

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import StrEnum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from mampc.arrays import Array, BoolArray
+from mampc.sensors import Fault
+from mampc.sentences import Sentence
 
 
-class Status(StrEnum):
+class Status(Sentence):
     """How a decision came about; `status.sentence` says it in words."""
-
-    sentence: str
-
-    def __new__(cls, value: str, sentence: str) -> Status:
-        member = str.__new__(cls, value)
-        member._value_ = value
-        member.sentence = sentence
-        return member
 
     OPTIMAL = "optimal", "The plan is proven to be the best one."
     FEASIBLE = (
@@ -37,25 +31,24 @@ class Status(StrEnum):
         "held_bad_measurement",
         "A state, measurement or reference was not a usable number: the previous inputs are held.",
     )
-    HELD_SOLVER_FAILED = "held_solver_failed", "The solver failed: the previous inputs are held."
+    HELD_SOLVER_FAILED = (
+        "held_solver_failed",
+        "The solver failed or ran out of time: the previous inputs are held.",
+    )
 
 
-class Remark(StrEnum):
+class Remark(Sentence):
     """What else there is to say about a decision; `remark.sentence` says it in words."""
-
-    sentence: str
-
-    def __new__(cls, value: str, sentence: str) -> Remark:
-        member = str.__new__(cls, value)
-        member._value_ = value
-        member.sentence = sentence
-        return member
 
     BUDGET_EXCEEDED = (
         "budget_exceeded",
         "The moves already made exceed the budget of their window: no further move is planned.",
     )
     BACK_INSIDE = "back_inside", "The applied inputs were outside their limits and go back inside."
+    RULES_SUSPENDED = (
+        "rules_suspended",
+        "The move rules were suspended: under them an output would leave its limits by more than the margin.",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +82,10 @@ class Decision:
         solve_time: seconds from call to answer.
         state: the controller's state for the next sample.
         remarks: anything else worth knowing.
+        violations: predicted excess of each output over its limits, the largest over i = 1..np, in output
+            units, shape (l,); zeros without output limits, not-a-number where nothing could be predicted.
+        ignored_outputs: outputs whose measurement was not believed at this sample, by name, and why; filled by
+            `Regulator`.
     """
 
     u: Array
@@ -100,7 +97,9 @@ class Decision:
     iterations: int
     solve_time: float
     state: Any
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Remark, ...]
+    violations: Array
+    ignored_outputs: Mapping[str, Fault] = field(default_factory=dict)
 
     @property
     def gap(self) -> float:

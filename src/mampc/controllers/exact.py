@@ -17,13 +17,14 @@ from time import perf_counter
 import numpy as np
 
 from mampc.arrays import Array, BoolArray, as_number
-from mampc.condensing import CondensedQP, Instance
+from mampc.condensing import CondensedQP
 from mampc.controllers.controller import HELD_BY, INSIDE, Plan
 from mampc.controllers.decision import ControllerState, Remark, Status
 from mampc.controllers.local_search import LocalSearch
 from mampc.controllers.pattern_solver import Incumbent, PatternSolver
 from mampc.controllers.ranking import Ranking, ranking_of
 from mampc.controllers.tree import PatternTree
+from mampc.instance import Instance
 from mampc.patterns import MoveRules, Past
 from mampc.qp import QPStatus
 
@@ -68,7 +69,7 @@ class ExactSearch:
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """The best moves of all admissible patterns for one sample."""
-        past = self.admissible.past(state.inputs)
+        past = self.admissible.past(state.inputs, instance.manual)
         if past.exceeded:
             return self._search(instance, past)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
         return self._search(instance, past)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mampc.arrays import Array
-from mampc.condensing import CondensedQP, Instance
+from mampc.condensing import CondensedQP
 from mampc.controllers.heuristic import Heuristic, HeuristicSearch
 from mampc.controllers.local_search import LocalSearch
 from mampc.controllers.pattern_solver import Incumbent
+from mampc.instance import Instance
 from mampc.patterns import MoveRules, Past
 
 

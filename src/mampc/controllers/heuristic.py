@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.arrays import Array
-from mampc.condensing import CondensedQP, Instance
+from mampc.condensing import CondensedQP
 from mampc.controllers.controller import HELD_BY, INSIDE, Plan
 from mampc.controllers.decision import ControllerState, Remark, Status
 from mampc.controllers.exact import TIE, Exact
 from mampc.controllers.pattern_solver import Incumbent, PatternSolver
+from mampc.instance import Instance
 from mampc.patterns import MoveRules, Past
 from mampc.qp_daqp import DaqpSolver
 
@@ -52,7 +53,7 @@ class HeuristicSearch:
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """The best plan on any proposed pattern."""
-        past, best = self.admissible.past(state.inputs), Incumbent()
+        past, best = self.admissible.past(state.inputs, instance.manual), Incumbent()
         rounds, guess = 0, None
         if past.left:
             last = None if state.guess is None else state.guess.ravel()

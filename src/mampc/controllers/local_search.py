@@ -14,8 +14,9 @@ from __future__ import annotations
 import numpy as np
 
 from mampc.arrays import Array, BoolArray
-from mampc.condensing import CondensedQP, Instance
+from mampc.condensing import CondensedQP
 from mampc.controllers.pattern_solver import Incumbent, PatternSolver
+from mampc.instance import Instance
 from mampc.patterns import Admissible, Exchanges, Past
 
 LEAST_GAIN = 1e-9  # of the cost without moves: smaller gains are not worth another exchange

@@ -8,18 +8,20 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mampc.arrays import Array
-from mampc.condensing import CondensedQP, Instance
+from mampc.arrays import Array, as_vector
+from mampc.condensing import CondensedQP
 from mampc.controllers.admm import ADMM
 from mampc.controllers.alternating import Alternating
 from mampc.controllers.controller import Controller, Plan
-from mampc.controllers.decision import ControllerState, Status
+from mampc.controllers.decision import ControllerState, Remark, Status
 from mampc.controllers.exact import Exact
 from mampc.controllers.greedy import Greedy
 from mampc.controllers.hard_thresholding import HardThresholding
 from mampc.controllers.l1 import L1, ReweightedL1
 from mampc.controllers.penalty_decomposition import PenaltyDecomposition
+from mampc.controllers.present import PresentLimits
 from mampc.errors import MampcError
+from mampc.instance import Instance
 from mampc.patterns import SAME, MoveRules
 from mampc.problem import TrackingProblem
 
@@ -50,6 +52,10 @@ METHODS: dict[str, type] = {
 }
 
 
+ON_LIMIT_VIOLATION = ("keep_budget", "ignore_budget")
+URGENT = 1e-6  # output units: what suspending the rules has to gain at least
+
+
 class MAMPC(Controller):
     """Minimum-attention model predictive control.
 
@@ -58,6 +64,10 @@ class MAMPC(Controller):
         rules: what moves cost and which patterns of moves are admissible (see `MoveRules`).
         method: "exact" (the default: proven best), "alternating" (the paper's), or another name of
             `mampc.METHODS`; or a method object with settings such as `mampc.Alternating(penalty=10.0)`.
+        on_limit_violation: "keep_budget" (the default) keeps the rules whatever happens; "ignore_budget"
+            suspends them, price and all, at samples where under them some output would leave its limits by more
+            than `violation_margin`, and by more than plain MPC would let it.
+        violation_margin: see there; in output units, a scalar or one value per output.
         settings: of a method given by name, such as `penalty=10.0`.
 
     Raises:
@@ -65,11 +75,29 @@ class MAMPC(Controller):
     """
 
     def __init__(
-        self, problem: TrackingProblem, rules: MoveRules, *, method: str | Method = "exact", **settings: Any
+        self,
+        problem: TrackingProblem,
+        rules: MoveRules,
+        *,
+        method: str | Method = "exact",
+        on_limit_violation: str = "keep_budget",
+        violation_margin: Any = 0.0,
+        **settings: Any,
     ) -> None:
         if not isinstance(rules, MoveRules):
             raise MampcError(f"rules: expected mampc.MoveRules, received {type(rules).__name__}")
         super().__init__(problem, bound_every_move=bool(np.any(rules.min_size)))
+        if on_limit_violation not in ON_LIMIT_VIOLATION:
+            raise MampcError(
+                f"on_limit_violation: expected one of {', '.join(ON_LIMIT_VIOLATION)}, "
+                f"received {on_limit_violation!r}"
+            )
+        margin = as_vector("violation_margin", violation_margin, problem.model.n_outputs)
+        if (margin < 0).any():
+            raise MampcError(
+                f"violation_margin: expected values of at least 0, received {violation_margin!r}"
+            )
+        self._margin = margin if on_limit_violation == "ignore_budget" else None
         self.rules = rules
         self.method = method_of(method, settings)
         self._admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
@@ -88,11 +116,16 @@ class MAMPC(Controller):
     def memory(self) -> int:
         return self.rules.memory
 
-    def _planned_from(self, state: ControllerState) -> ControllerState:
+    def _planned_from(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
         """A pattern says which inputs move, so none may be outside its limits when it is chosen."""
+        if present is not None and not present.crossed:
+            u = state.inputs[-1]
+            if ((u >= present.u_min[0]) & (u <= present.u_max[0])).all():
+                return state
+            return self._brought_inside(state, present)
         for u, (low, high) in zip(state.inputs[-1].tolist(), self._u_range, strict=True):
             if not low <= u <= high:
-                return self._brought_inside(state)
+                return self._brought_inside(state, None)
         return state
 
     def _price(self, moves: Array) -> float:
@@ -103,11 +136,34 @@ class MAMPC(Controller):
         if search is None:
             return self._unrestricted(instance)
         if state.samples >= search.warm_up:
-            return _without_rounding(search.plan(instance, state))
+            plan = _without_rounding(search.plan(instance, state))
+            return plan if self._margin is None else self._unless_urgent(plan, instance, self._margin)
         plan = self._unrestricted(instance)
         if plan.moves is None:
             return plan
         return plan._replace(status=Status.WARM_UP, lower_bound=-np.inf, objective=None)
+
+    def _unless_urgent(self, plan: Plan, instance: Instance, margin: Array) -> Plan:
+        """The plan, or that of plain MPC where the rules would cost a violation beyond the margin."""
+        if not self.condensed.n_violations:
+            return plan
+        moves = np.zeros(self.condensed.n_moves) if plan.moves is None else plan.moves
+        violations = self.condensed.violations(instance, moves)
+        if not (violations > margin).any():
+            return plan
+        urgent = self._unrestricted(instance)
+        if urgent.moves is None:
+            return plan
+        lower = self.condensed.violations(instance, urgent.moves) < violations - URGENT
+        if not (lower & (violations > margin)).any():
+            return plan
+        return urgent._replace(
+            status=Status.FEASIBLE,
+            lower_bound=-np.inf,
+            objective=None,
+            inputs=None,
+            remarks=(*plan.remarks, Remark.RULES_SUSPENDED),
+        )
 
 
 def _without_rounding(plan: Plan) -> Plan:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from mampc.condensing import Instance
 from mampc.controllers.controller import Controller, Plan
 from mampc.controllers.decision import ControllerState
+from mampc.instance import Instance
 
 
 class MPC(Controller):

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.arrays import Array, BoolArray
-from mampc.condensing import CondensedQP, Instance, Restriction
+from mampc.condensing import CondensedQP, Restriction
+from mampc.instance import Instance
 from mampc.patterns import SAME, Admissible
 from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver
@@ -76,6 +77,12 @@ class PatternSolver:
         A search over signs stops at the deadline, of `perf_counter`.
         """
         base = instance.constant + self.admissible.charge(pattern)
+        every_lower, every_upper = instance.lower, instance.upper
+        if instance.present is not None:
+            own = instance.present.on(pattern)
+            if own is None:
+                return OnPattern(None, np.inf, QPStatus.INFEASIBLE, None, 0)
+            every_lower, every_upper = own
         v, n = self.condensed.n_violations, self.condensed.n_moves
         if not pattern.any() and not v:
             return OnPattern(np.zeros(n) if base < cutoff else None, base, QPStatus.OPTIMAL, None, 0)
@@ -87,7 +94,7 @@ class PatternSolver:
         f, H = instance.f[columns], program.H
         sizes = self.admissible.min_size[pattern]
         best, least, status = None, cutoff, QPStatus.INFEASIBLE
-        multipliers, iterations, pending = None, 0, [(instance.lower[bounds], instance.upper[bounds])]
+        multipliers, iterations, pending = None, 0, [(every_lower[bounds], every_upper[bounds])]
         while pending:
             if multipliers is not None and perf_counter() > deadline:
                 status = QPStatus.TIME_LIMIT

@@ -16,7 +16,8 @@ from collections import OrderedDict
 import numpy as np
 
 from mampc.arrays import Array, BoolArray
-from mampc.condensing import CondensedQP, Instance, Optimum, PatternOptimum
+from mampc.condensing import CondensedQP
+from mampc.instance import Instance, Optimum, PatternOptimum
 from mampc.patterns import Admissible, Past
 
 LARGEST_TABLE = 1_000_000  # entries; from here on the tree search is faster

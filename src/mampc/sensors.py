@@ -1,0 +1,175 @@
+"""Whether a measurement is believed: missing, out of range, jumping and stuck sensors.
+
+Every test is made against what the model predicts, since only that tells a fault from a move of the plant:
+
+- missing: not a number, infinite, masked, or beyond any engineering unit;
+- out of range: outside what the sensor can show;
+- jump: further from its prediction than `largest_jump`. Where it stays there (`confirm` samples within
+  `largest_jump` of one another), it is the plant that jumped, and it is believed;
+- stuck: to the last bit the same for `stuck_after` samples, while the model moved that output by more than a
+  fifth of `largest_jump`. It is believed again once it changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mampc.arrays import LARGEST, Array, BoolArray, as_array, as_limit, as_vector, as_whole, is_usable
+from mampc.errors import MampcError
+from mampc.estimation import static_response
+from mampc.problem import TrackingProblem
+from mampc.sentences import Sentence
+
+OF_REACH = 0.1  # default jump, as a share of what the inputs' whole range does to an output
+STUCK = 0.2  # predicted movement, as a share of the largest jump, that a working sensor shows
+
+
+class Fault(Sentence):
+    """Why a measurement was ignored; `fault.sentence` says it in words."""
+
+    MISSING = "missing", "No usable number came."
+    OUT_OF_RANGE = "out_of_range", "The value is outside what the sensor can show."
+    JUMP = "jump", "The value is too far from its prediction to be believed at once."
+    STUCK = "stuck", "The value stays the same to the last bit although the output must have moved."
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorChecks:
+    """When a measurement is believed; see the module for the tests.
+
+    Args:
+        y_low, y_high: what the sensors can show, in output units, a scalar or (l,); None for no range.
+        largest_jump: distance from its prediction at which a measurement is believed at once, in output
+            units, a scalar or (l,). Default: a tenth of what the inputs' whole range does to that output at
+            rest, where that range is finite; infinite (no test for jumps and stuck sensors) elsewhere.
+        confirm: >= 1, samples after which a jump that stays is believed.
+        stuck_after: >= 2, equal samples after which a sensor may be stuck; None for never.
+
+    Raises:
+        MampcError: values out of range.
+    """
+
+    y_low: Any = None
+    y_high: Any = None
+    largest_jump: Any = None
+    confirm: int = 3
+    stuck_after: int | None = 10
+
+    def __post_init__(self) -> None:
+        as_whole("confirm", self.confirm, 1)
+        if self.stuck_after is not None:
+            as_whole("stuck_after", self.stuck_after, 2)
+
+    def fitted(self, problem: TrackingProblem) -> Sensors:
+        """The checks for the outputs of one problem."""
+        return Sensors(self, problem)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorState:
+    """What the checks remember of each output, arrays of shape (l,).
+
+    Attributes:
+        y: the last number that came.
+        repeats: how many samples it has been the same.
+        moved: how far the model moved the output meanwhile; `LARGEST` once it counts as stuck.
+        doubted: how many samples in a row jumped to about the same place.
+        blind: samples in a row without any output believed.
+    """
+
+    y: Array
+    repeats: Array
+    moved: Array
+    doubted: Array
+    blind: int = 0
+
+
+class Sensors:
+    """`SensorChecks` for one problem; its `check` is pure."""
+
+    def __init__(self, checks: SensorChecks, problem: TrackingProblem) -> None:
+        l = problem.model.n_outputs
+        self._low = as_limit("y_low", checks.y_low, l, -np.inf)
+        self._high = as_limit("y_high", checks.y_high, l, np.inf)
+        if (self._low >= self._high).any():
+            raise MampcError(f"sensors: expected y_low < y_high, received {self._low} and {self._high}")
+        self._low, self._high = np.maximum(self._low, -LARGEST), np.minimum(self._high, LARGEST)
+        jump = _reach(problem) * OF_REACH
+        if checks.largest_jump is not None:
+            given = as_array("largest_jump", checks.largest_jump)
+            jump = (
+                np.full(l, np.inf)
+                if given.ndim == 0 and given == np.inf
+                else as_vector("largest_jump", given, l)
+            )
+            if (jump <= 0).any():
+                raise MampcError(
+                    f"largest_jump: expected values above zero, received {checks.largest_jump!r}"
+                )
+        self._jump, self._confirm = jump, checks.confirm
+        self._stuck_after = np.inf if checks.stuck_after is None else checks.stuck_after
+        self._names = problem.model.names.outputs
+        self._all, self._none = np.ones(l, dtype=bool), np.zeros(l)
+        self._start = SensorState(self._none, self._none, self._none, self._none)
+
+    def initial(self) -> SensorState:
+        """Before the first sample."""
+        return self._start
+
+    def check(
+        self, state: SensorState, y: Array, innovation: Array, movement: Array
+    ) -> tuple[BoolArray, dict[str, Fault], SensorState]:
+        """Judge one sample.
+
+        Args:
+            state: from `initial` or the last check.
+            y: measurements, shape (l,), finite or not.
+            innovation: measured less predicted outputs, shape (l,).
+            movement: how far the model moved the outputs since the last sample, shape (l,).
+
+        Returns:
+            Which outputs are believed, shape (l,); the fault of every other by its name; the next state.
+        """
+        if (
+            is_usable(y)
+            and (np.abs(innovation) <= self._jump).all()
+            and ((y >= self._low) & (y <= self._high) & (y != state.y)).all()
+        ):  # the everyday case, at once
+            return self._all, {}, SensorState(y.copy(), self._none, self._none, self._none)
+        missing = ~((y > -LARGEST) & (y < LARGEST))
+        out = ~missing & ((y < self._low) | (y > self._high))
+        came = ~(missing | out)
+        same = came & (y == state.y)
+        repeats = np.where(came, np.where(same, state.repeats + 1, 0), state.repeats)
+        moved = np.where(came & ~same, 0.0, state.moved + movement)
+        moving = np.abs(moved) > np.minimum(STUCK * self._jump, LARGEST / 2)
+        stuck = same & (repeats >= self._stuck_after) & moving
+        moved[stuck] = LARGEST
+        jumped = came & ~stuck & (np.abs(innovation) > self._jump)
+        doubted = np.where(came, 0.0, state.doubted)
+        near = jumped & (np.abs(y - state.y) <= self._jump)
+        doubted[jumped] = 1.0
+        doubted[near] = state.doubted[near] + 1.0
+        jump = jumped & (doubted < self._confirm)
+        believed = came & ~stuck & ~jump
+        after = SensorState(
+            np.where(came, y, state.y), repeats, moved, doubted, 0 if believed.any() else state.blind + 1
+        )
+        faults = {}
+        for fault, affected in (
+            (Fault.MISSING, missing), (Fault.OUT_OF_RANGE, out), (Fault.STUCK, stuck), (Fault.JUMP, jump),
+        ):  # fmt: skip
+            faults.update({self._names[i]: fault for i in np.flatnonzero(affected)})
+        return believed, faults, after
+
+
+def _reach(problem: TrackingProblem) -> Array:
+    """How far the whole range of the inputs moves each output at rest, shape (l,)."""
+    model, limits = problem.model, problem.limits
+    gain = np.abs(static_response(model)[:, : model.n_inputs])
+    ranges = np.broadcast_to(limits.u_max - limits.u_min, gain.shape)
+    reach: Array = np.where(gain > 0, gain * np.where(gain > 0, ranges, 0.0), 0.0).sum(axis=1)
+    return np.where(reach > 0, reach, np.inf)
