@@ -23,7 +23,8 @@ from mampc.controllers.decision import ControllerState, Remark, Status
 from mampc.controllers.local_search import LocalSearch
 from mampc.controllers.pattern_solver import Incumbent, PatternSolver
 from mampc.controllers.ranking import Ranking, ranking_of
-from mampc.controllers.tree import PatternTree
+from mampc.controllers.relaxation import Relaxation
+from mampc.controllers.tree import PatternTree, Priced
 from mampc.instance import Instance
 from mampc.patterns import MoveRules, Past
 from mampc.qp import QPStatus
@@ -66,6 +67,7 @@ class ExactSearch:
         if self._ranking is None:
             self._tree = PatternTree(condensed, self.admissible)
             self._local = LocalSearch(condensed, self.admissible)
+            self._relaxation = Relaxation(condensed)
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """The best moves of all admissible patterns for one sample."""
@@ -120,17 +122,14 @@ class ExactSearch:
         best, deadline = Incumbent(), self._deadline()
         best.offer(self._solver.solve(instance, np.zeros(self.condensed.n_moves, dtype=bool)))
         self._local.offer(self._solver, instance, past, best, deadline)
-        f, constant = instance.f_moves, instance.constant
-        if best.multipliers is not None:
-            f, constant = self.condensed.relaxed_limits(instance, best.multipliers)
         tie = TIE * max(1e-6, instance.constant)
-
-        def leaf(pattern: BoolArray, bound: float) -> float:
-            best.offer(self._solver.solve(instance, pattern, best.objective, deadline))
-            return best.objective - tie - constant
-
-        cutoff = best.objective - tie - constant
-        open_bound = self._tree.search(f, past, cutoff, deadline, leaf) + constant
+        sample = Sample(self, instance, best, deadline, tie)
+        plain = None
+        if instance.margins.min(initial=np.inf) < 0:  # plain MPC runs into limits
+            plain = sample.relaxed(np.ones(self.condensed.n_moves, dtype=bool))
+        limits = [limits for limits in (plain, sample.priced(best.multipliers)) if limits is not None]
+        priced = [(instance.f_moves, instance.constant), *limits]
+        open_bound = self._tree.search(priced, past, best.objective - tie, deadline, sample)
         if open_bound < best.objective - tie:
             return self._plan(instance, best, open_bound, Status.TIME_LIMIT)
         return self._plan(instance, best, best.objective)
@@ -149,3 +148,27 @@ class ExactSearch:
             return Plan(hold, status, best.solved, bound)
         lower = None if status is Status.OPTIMAL else min(bound, best.objective)
         return Plan(best.moves, status, best.solved, lower, None, None, best.objective)
+
+
+class Sample:
+    """One sample as the tree sees it: patterns are solved for, and limits priced, on demand."""
+
+    def __init__(
+        self, search: ExactSearch, instance: Instance, best: Incumbent, deadline: float, tie: float
+    ) -> None:
+        self._condensed, self._solver, self._relaxation = search.condensed, search._solver, search._relaxation
+        self._instance, self._best, self._deadline, self._tie = instance, best, deadline, tie
+
+    def leaf(self, pattern: BoolArray) -> tuple[float, Priced | None]:
+        solved = self._solver.solve(self._instance, pattern, self._best.objective, self._deadline)
+        self._best.offer(solved)
+        return self._best.objective - self._tie, self.priced(solved.multipliers)
+
+    def relaxed(self, free: BoolArray) -> Priced | None:
+        return self.priced(self._relaxation.multipliers(self._instance, free))
+
+    def priced(self, multipliers: Array | None) -> Priced | None:
+        """The linear term and constant with limits priced in by multipliers, if any is not zero."""
+        if multipliers is None or not multipliers.any():
+            return None
+        return self._condensed.relaxed_limits(self._instance, multipliers)

@@ -8,13 +8,17 @@ quadratic in S alone: with H = U U' (U upper triangular) and y = U^-1 f, the rel
 
 where U_i is the leading block of U. Early moves matter most and late ones little, so that few nodes
 survive: this relaxation is what makes the search fast. Many nodes of one level are treated in one batch.
+
+Limits are priced into f by multipliers. No multipliers suit all nodes, so each is bounded with several, and takes
+the largest bound: those of leaves solved lately, and of the program that the most promising node of a batch
+relaxes to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from time import perf_counter
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -24,8 +28,10 @@ from mampc.patterns import Admissible, Past
 
 CHUNK = 256  # nodes treated at once
 KEPT_LEVELS = 300  # levels whose matrices are kept, for problems with no more moves than this
+MOST_TERMS = 8  # linear terms that nodes are bounded with
 
 Indices = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+Priced = tuple[Array, float]  # linear term, shape (n_moves,), and constant with limits priced in
 
 
 class Nodes(NamedTuple):
@@ -47,8 +53,42 @@ class Nodes(NamedTuple):
     now: Indices
     bound: Array
 
-    def take(self, rows: Indices | BoolArray) -> Nodes:
+    def take(self, rows: Indices | BoolArray | slice) -> Nodes:
         return Nodes._make(array[rows] for array in self)
+
+
+class Terms:
+    """Linear terms with limits priced in, one a column; the first is that without prices.
+
+    Attributes:
+        f: shape (n, K).
+        y: U^-1 f, shape (n, K).
+        tail: relaxed optimum of the moves from i on, constants included, shape (n + 1, K).
+    """
+
+    def __init__(self, f: Array, constant: float, U_inverse: Array) -> None:
+        self.f = f[:, None]
+        self.y = U_inverse @ self.f
+        free = -0.5 * np.cumsum((self.y * self.y)[::-1], axis=0)[::-1]
+        self.tail = np.vstack([free, np.zeros((1, 1))]) + constant
+
+    def add(self, new: Terms) -> Terms:
+        """Take one more term, in place of the oldest but the first where there are too many; returns it."""
+        drop = 2 if self.f.shape[1] == MOST_TERMS else 1
+        for name in ("f", "y", "tail"):
+            kept = getattr(self, name)
+            setattr(self, name, np.hstack([kept[:, :1], kept[:, drop:], getattr(new, name)]))
+        return new
+
+
+class Callbacks(Protocol):
+    """What a search asks of the sample at hand; patterns have shape (n_moves,)."""
+
+    def leaf(self, pattern: BoolArray) -> tuple[float, Priced | None]:
+        """Try a pattern: the new cutoff, and its limits priced in if any are active."""
+
+    def relaxed(self, free: BoolArray) -> Priced | None:
+        """The limits priced in that are active when these moves are free, if any are."""
 
 
 class PatternTree:
@@ -67,34 +107,33 @@ class PatternTree:
         self._least_price = float(price.min())
 
     def search(
-        self, f: Array, past: Past, cutoff: float, deadline: float, leaf: Callable[[BoolArray, float], float]
+        self, priced: Sequence[Priced], past: Past, cutoff: float, deadline: float, sample: Callbacks
     ) -> float:
         """Visit every admissible pattern that may cost less than the cutoff.
 
         Args:
-            f: linear term, shape (n_moves,).
+            priced: the linear term and constant of the cost, and those with limits priced in, if any.
             past: what the applied moves leave.
-            cutoff: patterns at or above it (relative to no moves, prices included) are of no interest.
+            cutoff: patterns at or above it (prices included) are of no interest.
             deadline: of `perf_counter`.
-            leaf: called with a pattern, shape (n_moves,), and its bound, best bound first; returns the new cutoff.
+            sample: `leaf` is called with patterns, best bound first.
 
         Returns:
             A lower bound over everything that was not visited: infinite when the search is complete.
         """
-        of, order = self.admissible, self._order
-        n = len(order)
-        f = f[order]
-        y = self._U_inverse @ f
-        tail = np.append(-0.5 * np.cumsum((y * y)[::-1])[::-1], 0.0)  # relaxed optimum of the moves from i on
+        of, n = self.admissible, len(self._order)
+        terms, *others = map(self._terms, priced)
+        for other in others:
+            terms.add(other)
         rest = np.array(past.rest, dtype=np.intp)
         root = Nodes(
             np.full((1, 0), -1), np.zeros(1, np.intp), np.zeros(1), (rest - of.rules.dwell)[None],
-            np.zeros(1, np.intp), np.array([tail[0] + self._least_price]),
+            np.zeros(1, np.intp), np.array([terms.tail[0].max() + self._least_price]),
         )  # fmt: skip
         pending = [(0, root)] if past.left > 0 and n else []
         while pending:
             if perf_counter() > deadline:
-                return float(min(nodes.bound.min() for _, nodes in pending))
+                return _least_bound(pending)
             level, nodes = pending.pop()
             nodes = nodes.take(nodes.bound < cutoff)
             if not len(nodes.bound):
@@ -105,29 +144,66 @@ class PatternTree:
                 nodes = nodes.take(by_bound[:CHUNK])
             children, including = self._children(level, nodes, past)
             if including:
-                made = slice(len(children.used) - including, None)
-                values = self._values(children.chosen[made], f) + children.charge[made]
-                for row in np.argsort(values, kind="stable").tolist():
-                    if values[row] >= cutoff:
-                        break
-                    pattern = np.zeros(of.n_moves, dtype=bool)
-                    chosen = children.chosen[made][row]
-                    pattern[order[chosen[chosen >= 0]]] = True
-                    cutoff = leaf(pattern, float(values[row]))
-                    if perf_counter() > deadline:  # these nodes bound their descendants, this leaf among them
-                        return float(min(some.bound.min() for _, some in [*pending, (level, nodes)]))
+                made = children.take(slice(len(children.used) - including, None))
+                cutoff = self._try(made, terms, cutoff, deadline, sample)
+                if (
+                    perf_counter() > deadline
+                ):  # these nodes bound their descendants, those just tried among them
+                    return _least_bound([*pending, (level, nodes)])
             if level + 1 == n:
                 continue
             children = self._growable(level, children, past)
-            if not len(children.used):
-                continue
-            further = np.full(len(children.used), self._least_price)
-            if of.simultaneous:
-                further[children.now > 0] = 0.0
-            relaxed = tail[level + 1] + self._relaxed(level, children.chosen, y)
-            children = children._replace(bound=relaxed + children.charge + further)
-            pending.append((level + 1, children.take(children.bound < cutoff)))
+            if len(children.used):
+                bound = self._bound(level, children, terms, cutoff, sample)
+                pending.append((level + 1, children._replace(bound=bound).take(bound < cutoff)))
         return np.inf
+
+    def _try(self, made: Nodes, terms: Terms, cutoff: float, deadline: float, sample: Callbacks) -> float:
+        """Try the patterns of these nodes with no further move, best bound first; returns the new cutoff."""
+
+        def values_for(terms: Terms) -> Array:
+            values: Array = (self._minimum(self.H, terms.f, made.chosen) + terms.tail[-1]).max(axis=1)
+            return values + made.charge
+
+        values = values_for(terms)
+        while values[row := int(values.argmin())] < cutoff and perf_counter() <= deadline:
+            cutoff, limits = sample.leaf(self._pattern(made.chosen[row]))
+            values[row] = np.inf
+            if limits is None:
+                continue
+            np.maximum(values, values_for(terms.add(self._terms(limits))), out=values)
+            # Where a pattern does not move, its multipliers say little of those that do: price all that are left.
+            if (left := values < cutoff).any():
+                limits = sample.relaxed(self._pattern(made.chosen[left]))
+                if limits is not None:
+                    np.maximum(values, values_for(terms.add(self._terms(limits))), out=values)
+        return cutoff
+
+    def _bound(self, level: int, children: Nodes, terms: Terms, cutoff: float, sample: Callbacks) -> Array:
+        """The bounds of nodes that have decided the moves up to `level`."""
+        further = np.full(len(children.used), self._least_price)
+        if self.admissible.simultaneous:
+            further[children.now > 0] = 0.0
+        further += children.charge
+        bound = np.maximum(children.bound, self._relaxed(level, children.chosen, terms) + further)
+        row = int(bound.argmin())
+        if terms.f.shape[1] > 1 and bound[row] < cutoff:  # limits matter at this sample
+            free = self._pattern(children.chosen[row])
+            free[self._order[level + 1 :]] = True
+            limits = sample.relaxed(free)
+            if limits is not None:
+                latest = terms.add(self._terms(limits))
+                bound = np.maximum(bound, self._relaxed(level, children.chosen, latest) + further)
+        return np.asarray(bound)
+
+    def _terms(self, priced: Priced) -> Terms:
+        return Terms(priced[0][self._order], priced[1], self._U_inverse)
+
+    def _pattern(self, chosen: Indices) -> BoolArray:
+        """The moves made at nodes `chosen`, shape (n_moves,)."""
+        pattern = np.zeros(self.admissible.n_moves, dtype=bool)
+        pattern[self._order[chosen[chosen >= 0]]] = True
+        return pattern
 
     def _children(self, level: int, nodes: Nodes, past: Past) -> tuple[Nodes, int]:
         """The nodes without and, after them, with the level's move, and how many the latter are."""
@@ -173,36 +249,39 @@ class PatternTree:
             spent &= nodes.now == 0
         return nodes.take(~spent)
 
-    def _values(self, chosen: Indices, f: Array) -> Array:
-        """The bound of each pattern with no further move."""
-        return self._minimum(self.H, f, chosen)
-
-    def _relaxed(self, level: int, chosen: Indices, y: Array) -> Array:
-        """The part of the relaxed optimum that belongs to the moves made, all later moves being free."""
+    def _relaxed(self, level: int, chosen: Indices, terms: Terms) -> Array:
+        """The relaxed optimum with the moves made, all later moves being free."""
         U = self._U[: level + 1, : level + 1]
         H = self._levels[level]
         if H is None:
             H = U @ U.T
             if len(self._levels) <= KEPT_LEVELS:
                 self._levels[level] = H
-        return self._minimum(H, U @ y[: level + 1], chosen)
+        values = self._minimum(H, U @ terms.y[: level + 1], chosen) + terms.tail[level + 1]
+        return np.asarray(values.max(axis=1))
 
     def _minimum(self, H: Array, f: Array, chosen: Indices) -> Array:
-        """min over the chosen moves of 1/2 d' H d + f' d, at least as large as their least sizes demand."""
+        """min over the chosen moves of 1/2 d' H d + f' d, at least as large as their least sizes demand.
+
+        For linear terms f, shape (n, K); the result has shape (N, K).
+        """
         size, width = chosen.shape
         if not width:
-            return np.zeros(size)
+            return np.zeros((size, f.shape[1]))
         none = chosen < 0
-        linear = np.where(none, 0.0, f[chosen])
+        linear = np.where(none[:, :, None], 0.0, f[chosen])
         matrices = H[chosen[:, :, None], chosen[:, None, :]]
         matrices[none[:, :, None] | none[:, None, :]] = 0.0
         matrices[:, np.arange(width), np.arange(width)] += none
         if not self.admissible.sized:
-            optima = -np.linalg.solve(matrices, linear[:, :, None])[:, :, 0]
-            values: Array = 0.5 * (linear * optima).sum(axis=1)
+            values: Array = -0.5 * (linear * np.linalg.solve(matrices, linear)).sum(axis=1)
             return values
         inverses = np.linalg.inv(matrices)
-        optima = -(inverses @ linear[:, :, None])[:, :, 0]
-        short = np.maximum(self._sizes[chosen] - np.abs(optima), 0.0)  # -1 has size zero
-        lift = 0.5 * (short * short / np.einsum("nii->ni", inverses)).max(axis=1)
+        optima = -(inverses @ linear)
+        short = np.maximum(self._sizes[chosen][:, :, None] - np.abs(optima), 0.0)  # -1 has size zero
+        lift = 0.5 * (short * short / np.einsum("nii->ni", inverses)[:, :, None]).max(axis=1)
         return np.asarray(0.5 * (linear * optima).sum(axis=1) + lift)
+
+
+def _least_bound(pending: list[tuple[int, Nodes]]) -> float:
+    return float(min(nodes.bound.min(initial=np.inf) for _, nodes in pending))
