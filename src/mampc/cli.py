@@ -34,7 +34,7 @@ def main() -> None:
         Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"mampc: {error}")
         sys.exit(2)
     except KeyboardInterrupt:
-        print("mampc: interrupted; nothing was written", file=sys.stderr)
+        print("mampc: interrupted; what had finished is written", file=sys.stderr)
         sys.exit(130)
 
 
@@ -71,16 +71,14 @@ def run(
 
         mampc run my-study.toml --out results/valves
     """
-    from mampc.report.output import require_writable, write_study
+    from mampc.report.output import run_and_write
     from mampc.report.tables import comparison_tables
-    from mampc.study import load_study, run_study
+    from mampc.study import load_study
 
     plan = load_study(study, trust=True if trust else None)
     directory = Path("results") / Path(study).stem if out is None else out
-    require_writable(directory)
     with _progress() as show:
-        result = run_study(plan, show)
-        summary, missing = write_study(result, directory, show)
+        result, summary, missing = run_and_write(plan, directory, show)
     console = _console()
     for table in comparison_tables(plan, summary):
         console.print(table)
@@ -107,11 +105,9 @@ def reproduce(
 
         mampc reproduce --out results/paper
     """
-    from mampc.report.output import require_writable
     from mampc.report.reproduction import reproduce as run_all
     from mampc.report.tables import comparison_tables
 
-    require_writable(out)
     with _progress() as show:
         cases = run_all(out, show)
     console = _console()

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from mampc.errors import MampcError
 
+PARTIAL = ".partial-"  # in the names of files not yet whole, before the number of their process
+
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
@@ -18,7 +20,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         MampcError: the file cannot be written.
     """
     target = Path(path)
-    unfinished = target.with_name(f".{target.name}.partial-{os.getpid()}")
+    unfinished = target.with_name(f".{target.name}{PARTIAL}{os.getpid()}")
     try:
         yield unfinished
         unfinished.replace(target)

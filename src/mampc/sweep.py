@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mampc.study.running import Prepared, prepare, run_controller
+from mampc.study.running import Prepared, prepare, regulator_of, run_controller
 from mampc.study.schema import ControllerTable, ScenarioTable, Study
 
 SETTINGS = {
@@ -105,7 +105,8 @@ def _point(
     changed, scenario, sparse = varied(study, scenario, sparse, setting, value)
     figures = []
     for table in (plain, sparse):
-        metrics = run_controller(changed, prepared, scenario, table).metrics(threshold=study.threshold)
+        regulator = regulator_of(changed, prepared.model, table)
+        metrics = run_controller(changed, prepared, scenario, regulator).metrics(threshold=study.threshold)
         figures.append((float(metrics.sparse_density.sum()), metrics.tracking_error))
     (base_changes, base_error), (changes, error) = figures
     return Point(

@@ -218,7 +218,7 @@ class Controller(ABC):
         if lower_bound is None:
             lower_bound = objective
         changes = moves.reshape(self._shape)
-        violations = self._no_violations
+        violations: Array = self._no_violations
         if inputs is None:
             if self._du_max is not None:
                 changes = np.minimum(np.maximum(changes, -self._du_max), self._du_max)

@@ -1,144 +1,109 @@
-"""Writing a study's results: everything is made ready beside the target, then put in place at once."""
+"""Running a study and writing its results, each as soon as it is there."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from mampc.drawing import styled
 from mampc.errors import MampcError
+from mampc.files import written_whole
 from mampc.report.figures import study_figures
+from mampc.report.folder import ResultFolder
 from mampc.report.summary import summarise
-from mampc.study import StudyResult
+from mampc.simulation import Run
+from mampc.study import Study, StudyResult, run_study
+from mampc.study.running import Prepared
 from mampc.study.schema import file_word
 
 SUMMARY = "summary.json"
-MANIFEST = ".mampc-files"  # what a run wrote, so that the next can clear it away
+FIGURE_KINDS = ("png", "svg")
 
 
-def require_writable(directory: Path) -> None:
-    """Find out before a long run whether its results can be written; raises `MampcError`."""
-    shutil.rmtree(_staging(directory), ignore_errors=True)
+class StudyFiles:
+    """Puts the results of one study into a folder.
 
-
-@contextmanager
-def published_together(directory: Path) -> Iterator[Path]:
-    """A folder to write into; on success its files appear in `directory`, on failure nothing changes.
-
-    A new directory appears in one rename. In an existing one each file is replaced whole, files of the
-    last run that this one does not have go away, and summary.json goes first and comes back last: where it
-    stands, the files around it belong to it. Files of others stay.
-
-    Raises:
-        MampcError: the directory cannot be written.
+    Args:
+        folder: receives them.
+        prefix: of their names, such as "tank/"; default none.
     """
-    staging = _staging(directory)
-    try:
-        yield staging
-        files = [path for path in staging.rglob("*") if path.is_file()]
-        names = sorted(path.relative_to(staging).as_posix() for path in files)
-        (staging / MANIFEST).write_text("\n".join(names) + "\n", encoding="utf-8")
-        if not directory.exists():
-            staging.chmod(0o755)
-            staging.rename(directory)
-            return
-        (directory / SUMMARY).unlink(missing_ok=True)
-        for name in _last_run(directory) - set(names):
-            (directory / name).unlink(missing_ok=True)
-        for name in sorted([*names, MANIFEST], key=lambda name: name == SUMMARY):
-            (directory / name).parent.mkdir(parents=True, exist_ok=True)
-            (staging / name).replace(directory / name)
-    except OSError as error:
-        raise MampcError(f"{directory}: expected to write the results, received: {error}") from None
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+
+    def __init__(self, folder: ResultFolder, prefix: str = "") -> None:
+        self._folder, self._prefix = folder, prefix
+
+    def model(self, prepared: Prepared | StudyResult) -> None:
+        """The model that all controllers use, and the record it was identified from."""
+        prepared.model.save(self._folder.place(f"{self._prefix}model.json"))
+        if prepared.data is not None:
+            prepared.data.to_csv(self._folder.place(f"{self._prefix}identification.csv"))
+
+    def trajectory(self, scenario: str, controller: str, run: Run) -> None:
+        """One controller's run in one scenario."""
+        run.to_csv(self._folder.place(f"{self._prefix}{trajectory_name(scenario, controller)}"))
+
+    def figure(self, name: str, figure: Any) -> str:
+        """A figure as PNG and SVG; returns the name of the latter in the folder."""
+        stem = f"{self._prefix}figures/{name}"
+        for kind in FIGURE_KINDS:
+            self._folder.place(f"{stem}.{kind}")
+        save_figure(figure, self._folder.path / stem)
+        return f"{stem}.svg"
+
+    def summary(self, result: StudyResult) -> dict[str, Any]:
+        """summary.json; returns its content."""
+        summary = summarise(result)
+        with written_whole(self._folder.place(f"{self._prefix}{SUMMARY}")) as unfinished:
+            text = json.dumps(summary, indent=1, allow_nan=False)
+            unfinished.write_text(text + "\n", encoding="utf-8")
+        return summary
 
 
-def _staging(directory: Path) -> Path:
-    """A new folder on the same disk as `directory`; what killed runs left behind is cleared away."""
-    try:
-        if directory.exists() and not directory.is_dir():
-            raise MampcError(f"--out: expected a directory, received the file {directory}")
-        parent, prefix = (
-            (directory, ".partial-")
-            if directory.exists()
-            else (directory.parent, f".{directory.name}.partial-")
-        )
-        parent.mkdir(parents=True, exist_ok=True)
-        for left in parent.glob(f"{prefix}*"):
-            if not _running(left.name.removeprefix(prefix).split("-")[0]):
-                shutil.rmtree(left, ignore_errors=True)
-        return Path(tempfile.mkdtemp(prefix=f"{prefix}{os.getpid()}-", dir=parent))
-    except OSError as error:
-        raise MampcError(f"--out: expected a directory that can be written, received: {error}") from None
-
-
-def _running(process: str) -> bool:
-    try:
-        os.kill(int(process), 0)
-    except (ValueError, ProcessLookupError):
-        return False
-    except OSError:
-        return True
-    return True
-
-
-def _last_run(directory: Path) -> set[str]:
-    """The files that the last run put into the directory, as far as its list can be believed."""
-    try:
-        names = (directory / MANIFEST).read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return set()
-    return {
-        name for name in names if name and (directory / name).resolve().is_relative_to(directory.resolve())
-    }
-
-
-def write_study(
-    result: StudyResult, directory: Path, on_stage: Callable[[str], None] = lambda stage: None
-) -> tuple[dict[str, Any], str | None]:
-    """Write summary.json, trajectories, the model, the record and figures into `directory`.
+def run_and_write(
+    study: Study, directory: Path, on_stage: Callable[[str], None] = lambda stage: None
+) -> tuple[StudyResult, dict[str, Any], str | None]:
+    """Run a study; each trajectory is written when its run has finished, summary.json when all is there.
 
     Returns:
-        The content of summary.json, and why there are no figures, if so.
+        The result, the content of summary.json, and why there are no figures, if so.
+
+    Raises:
+        MampcError: values of the study that do not fit its plant or model, or a folder that cannot be written.
     """
+    folder = ResultFolder(directory, last=SUMMARY)
+    files = StudyFiles(folder)
+
+    def begin(prepared: Prepared) -> None:
+        folder.clear()
+        files.model(prepared)
+
+    result = run_study(study, on_stage, on_begin=begin, on_run=files.trajectory)
     missing = None
-    with published_together(directory) as folder:
-        try:
-            for name, figure in study_figures(result):
-                on_stage(f"figure {name}")
-                save_figure(figure, folder / "figures" / name)
-        except MampcError as error:
-            missing = str(error)
-        summary = write_files(result, folder)
-    return summary, missing
+    try:
+        for name, figure in study_figures(result):
+            on_stage(f"figure {name}")
+            files.figure(name, figure)
+    except MampcError as error:
+        missing = str(error)
+    return result, files.summary(result), missing
 
 
-def write_files(result: StudyResult, folder: Path) -> dict[str, Any]:
-    """Write everything but the figures into a folder; returns the content of summary.json."""
-    result.model.save(folder / "model.json")
-    if result.data is not None:
-        result.data.to_csv(folder / "identification.csv")
-    for scenario, runs in result.runs.items():
-        for controller, run in runs.items():
-            run.to_csv(folder / f"{file_word(scenario)}_{file_word(controller)}.csv")
-    summary = summarise(result)
-    (folder / SUMMARY).write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return summary
+def trajectory_name(scenario: str, controller: str) -> str:
+    """The file of one controller's run in one scenario."""
+    return f"{file_word(scenario)}_{file_word(controller)}.csv"
+
+
+def trajectories(study: Study) -> Iterator[tuple[str, str, str]]:
+    """Scenario, controller and file of every run of a study."""
+    for scenario in study.scenarios:
+        for controller in study.controllers:
+            yield scenario.name, controller.name, trajectory_name(scenario.name, controller.name)
 
 
 def save_figure(figure: Any, stem: Path) -> None:
-    """Write a figure as PNG and SVG, `stem` being the path without its ending."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
+    """Write a figure as PNG and SVG, each whole, `stem` being the path without its ending."""
     with styled():
-        try:
-            figure.savefig(stem.with_name(stem.name + ".png"))
-            figure.savefig(stem.with_name(stem.name + ".svg"), metadata={"Date": None})
-        except OSError as error:
-            raise MampcError(f"{stem}: expected figures that can be written, received: {error}") from None
+        for kind in FIGURE_KINDS:
+            with written_whole(stem.with_name(f"{stem.name}.{kind}")) as unfinished:
+                figure.savefig(unfinished, format=kind, metadata={"Date": None} if kind == "svg" else None)

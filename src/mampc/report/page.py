@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 STYLE = """
@@ -19,7 +20,7 @@ h1, h2, h3 { line-height: 1.2; }
 
 
 class Page:
-    """Collects blocks in order; `write` puts them into files."""
+    """Collects blocks in order; `texts` puts them together."""
 
     def __init__(self, title: str) -> None:
         self.title = title
@@ -52,15 +53,15 @@ class Page:
         self._figures[mark] = path
         self._html.append(f"<figure>{mark}<figcaption>{html.escape(caption)}</figcaption></figure>")
 
-    def write(self, folder: Path, stem: str) -> None:
-        """Write stem.md and stem.html into `folder`, where the figures are already."""
-        (folder / f"{stem}.md").write_text("\n\n".join(self._markdown) + "\n", encoding="utf-8")
+    def texts(self, folder: Path) -> Iterator[tuple[str, str]]:
+        """Ending and text of the page's files, Markdown and HTML; `folder` holds the figures already."""
+        yield "md", "\n\n".join(self._markdown) + "\n"
         body = "\n".join(self._html)
         for number, (mark, path) in enumerate(self._figures.items()):
             body = body.replace(mark, _drawing((folder / path).read_text(encoding="utf-8"), f"f{number}-"))
         head = f'<meta charset="utf-8"><title>{html.escape(self.title)}</title><style>{STYLE}</style>'
         page = f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
-        (folder / f"{stem}.html").write_text(page, encoding="utf-8")
+        yield "html", page
 
 
 def _drawing(svg: str, prefix: str) -> str:

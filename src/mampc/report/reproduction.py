@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mampc.report.figures import sensitivity_figure, study_figures
-from mampc.report.output import published_together, save_figure, write_files
+from mampc.report.folder import ResultFolder
+from mampc.report.output import StudyFiles
 from mampc.report.page import Page
 from mampc.report.summary import summarise
 from mampc.report.tables import baseline
@@ -64,6 +65,7 @@ def reproduce(directory: Path, on_stage: Callable[[str], None] = lambda stage: N
     """
     from joblib import Parallel, delayed
 
+    folder = ResultFolder(directory, last="report.html")
     studies = [load_study(name) for name in CASES]
     on_stage("both case studies, noise-free and noisy")
     results = Parallel(n_jobs=-1)(delayed(run_study)(study) for study in studies)
@@ -78,14 +80,16 @@ def reproduce(directory: Path, on_stage: Callable[[str], None] = lambda stage: N
             on_point=_counted(study, on_stage),
         )
         cases.append(Case(result, summarise(result), points))
-    with published_together(directory) as folder:
-        page = Page("The paper's results beside ours")
-        _introduce(page, cases)
-        for case in cases:
-            on_stage(f"{case.study.name}: figures")
-            _write_case(page, case, folder)
-        _judge(page, cases)
-        page.write(folder, "report")
+    folder.clear()
+    page = Page("The paper's results beside ours")
+    _introduce(page, cases)
+    for case in cases:
+        on_stage(f"{case.study.name}: figures")
+        _write_case(page, case, folder)
+    _judge(page, cases)
+    for ending, text in page.texts(directory):
+        with folder.writing(f"report.{ending}") as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
     return cases
 
 
@@ -109,11 +113,14 @@ def _introduce(page: Page, cases: list[Case]) -> None:
     )
 
 
-def _write_case(page: Page, case: Case, folder: Path) -> None:
+def _write_case(page: Page, case: Case, folder: ResultFolder) -> None:
     name = case.study.name
-    own = folder / name
-    own.mkdir()
-    write_files(case.result, own)
+    files = StudyFiles(folder, f"{name}/")
+    files.model(case.result)
+    for scenario, runs in case.result.runs.items():
+        for controller, run in runs.items():
+            files.trajectory(scenario, controller, run)
+    files.summary(case.result)
     page.heading(f"Case study: {name}")
     identified = case.result.identified
     assert identified is not None
@@ -128,15 +135,14 @@ def _write_case(page: Page, case: Case, folder: Path) -> None:
         )
         page.table(*_table(case, part))
     for figure_name, figure in study_figures(case.result):
-        save_figure(figure, own / "figures" / figure_name)
-        page.figure(f"{name}/figures/{figure_name}.svg", figure_name.replace("-", " "))
+        page.figure(files.figure(figure_name, figure), figure_name.replace("-", " "))
     page.heading(f"Sensitivity: {name}", 3)
     page.text(
         f"{_papers(case.study)[-1].name} in the {case.study.scenarios[-1].name} scenario, one setting "
         "changed at a time; ratios to MPC with the same setting."
     )
-    save_figure(sensitivity_figure(case.points, SETTINGS), own / "figures" / "sensitivity")
-    page.figure(f"{name}/figures/sensitivity.svg", "ratios to MPC as one setting changes")
+    figure = sensitivity_figure(case.points, SETTINGS)
+    page.figure(files.figure("sensitivity", figure), "ratios to MPC as one setting changes")
     rows = [
         [SETTINGS[point.setting], f"{point.value:g}", _text(point.changes_ratio), _text(point.error_ratio)]
         for point in case.points

@@ -21,6 +21,7 @@ from mampc.patterns import MoveRules
 from mampc.plants import Plant
 from mampc.problem import Limits, TrackingProblem
 from mampc.regulator import Regulator
+from mampc.sensors import SensorChecks
 from mampc.signals import prbs, steps
 from mampc.simulation import Run, simulate
 from mampc.study.plugins import make_plant
@@ -65,23 +66,35 @@ class Prepared:
     identified: Identified | None
 
 
-def run_study(study: Study, on_stage: Callable[[str], None] = lambda stage: None) -> StudyResult:
+def run_study(
+    study: Study,
+    on_stage: Callable[[str], None] = lambda stage: None,
+    *,
+    on_begin: Callable[[Prepared], None] = lambda prepared: None,
+    on_run: Callable[[str, str, Run], None] = lambda scenario, controller, run: None,
+) -> StudyResult:
     """Excite, identify and run every controller in every scenario.
 
     Args:
         study: from `load_study`.
         on_stage: called with a line of text when a stage begins, to show progress.
+        on_begin: called before the first run, when everything the study says has been found to fit.
+        on_run: called with scenario, controller and run when one has finished.
 
     Raises:
         MampcError: values of the study that do not fit its plant or model.
     """
     prepared = prepare(study, on_stage)
+    regulators = {table.name: regulator_of(study, prepared.model, table) for table in study.controllers}
+    on_begin(prepared)
     runs: dict[str, dict[str, Run]] = {}
     for scenario in study.scenarios:
         runs[scenario.name] = {}
         for table in study.controllers:
             on_stage(f"{scenario.name}: {table.name}")
-            runs[scenario.name][table.name] = run_controller(study, prepared, scenario, table)
+            run = run_controller(study, prepared, scenario, regulators[table.name])
+            runs[scenario.name][table.name] = run
+            on_run(scenario.name, table.name, run)
     warnings = _warnings(study, prepared.model) + _faults(runs)
     return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings)
 
@@ -111,7 +124,12 @@ def prepare(study: Study, on_stage: Callable[[str], None] = lambda stage: None) 
     return Prepared(tested, u_op, v_op, identified.model, data, identified)
 
 
-def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, table: ControllerTable) -> Run:
+def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
+    """The regulator that a study's tables describe."""
+    return Regulator(_controller(_problem(study, model), table), _estimator(study, model), **_sensors(study))
+
+
+def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator) -> Run:
     """One controller in one scenario of a study."""
     model, plant, at, T = prepared.model, prepared.plant, scenario.disturbance_at, study.steps
 
@@ -125,7 +143,7 @@ def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, ta
 
     return simulate(
         plant,
-        Regulator(_controller(_problem(study, model), table), _estimator(study, model)),
+        regulator,
         _reference(study, prepared),
         noise=scenario.noise,
         seed=scenario.seed,
@@ -183,7 +201,14 @@ def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
         return MPC(problem)
     assert table.rules is not None
     try:
-        return MAMPC(problem, MoveRules(**table.rules.model_dump()), method=table.method, **table.settings)
+        return MAMPC(
+            problem,
+            MoveRules(**table.rules.model_dump()),
+            method=table.method,
+            on_limit_violation=table.on_limit_violation,
+            violation_margin=table.violation_margin,
+            **table.settings,
+        )
     except MampcError as error:
         raise StudyError(f"controllers, {table.name!r}: {error}") from None
 
@@ -193,6 +218,15 @@ def _estimator(study: Study, model: StateSpace) -> KalmanFilter:
         return KalmanFilter.offset_free(model, **study.estimator.model_dump())
     except MampcError as error:
         raise StudyError(f"[estimator] {error}") from None
+
+
+def _sensors(study: Study) -> dict[str, Any]:
+    checks = study.sensors.model_dump()
+    blind = checks.pop("max_blind_steps")
+    try:
+        return {"sensors": SensorChecks(**checks), "max_blind_steps": blind}
+    except MampcError as error:
+        raise StudyError(f"[sensors] {error}") from None
 
 
 def _reference(study: Study, prepared: Prepared) -> Array:

@@ -149,6 +149,8 @@ class ControllerTable(Table):
     method: Word
     rules: RulesTable | None = None
     settings: dict[str, Any] = {}
+    on_limit_violation: Literal["keep_budget", "ignore_budget"] = "keep_budget"
+    violation_margin: Values = 0.0
     published: PublishedTable | None = None
 
     @model_validator(mode="after")
@@ -175,6 +177,15 @@ class EstimatorTable(Table):
     input_noise: Values | None = None
 
 
+class SensorsTable(Table):
+    y_low: Values | None = None
+    y_high: Values | None = None
+    largest_jump: Values | None = None
+    confirm: Annotated[int, Field(ge=1)] = 3
+    stuck_after: Annotated[int, Field(ge=2)] | None = 10
+    max_blind_steps: Annotated[int, Field(ge=0)] = 0
+
+
 class Study(Table):
     """A checked study; attributes are the keys of the file."""
 
@@ -188,6 +199,7 @@ class Study(Table):
     model: ModelTable | None = None
     problem: ProblemTable
     estimator: EstimatorTable = EstimatorTable()
+    sensors: SensorsTable = SensorsTable()
     reference: ReferenceTable
     scenarios: Annotated[list[ScenarioTable], Field(min_length=1)]
     controllers: Annotated[list[ControllerTable], Field(min_length=1)]
