@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import clarabel
 import numpy as np
+import pyscipopt
 from scipy import sparse
 
 from builders import cost_of, predicted, violation_scale
@@ -168,3 +169,43 @@ def best_on_every_pattern(problem, rules, x, u_previous, reference):
 def objective_of(problem, rules, x, past, reference, plan):
     """The objective of planned inputs by simulation, price included."""
     return cost_of(problem, x, past[-1], reference, plan) + charge(rules, moved(np.vstack([past[-1:], plan])))
+
+
+def scip_bounds(problem, rules, x, u_previous, reference, seconds):
+    """Lower and upper bound of the sparse optimum from rest, by SCIP on the big-M form; price and budget alike.
+
+    Every move needs finite limits; blocks, least sizes and limits per sample are left to brute force.
+    """
+    n_c, m, l = problem.control_horizon, problem.model.n_inputs, problem.model.n_outputs
+    program, n = program_of(problem, x, u_previous, reference), n_c * m
+    scip = pyscipopt.Model()
+    scip.hideOutput()
+    for name, value in {"limits/time": seconds, "limits/gap": 0.0, "numerics/feastol": 1e-9}.items():
+        scip.setParam(name, value)
+    z = [scip.addVar(lb=None) for _ in range(l + n)]
+    on = [scip.addVar(vtype="B") for _ in range(n)]
+    most = np.tile(np.minimum(problem.limits.du_max, problem.limits.u_max - problem.limits.u_min), n_c)
+    for row, bound in zip(program.rows, program.bounds, strict=True):
+        scip.addCons(pyscipopt.quicksum(row[i] * z[i] for i in np.flatnonzero(row)) <= bound)
+    for d, moves, size in zip(z[l:], on, most, strict=True):
+        scip.addCons(d <= size * moves)
+        scip.addCons(-d <= size * moves)
+    counted_ = on
+    if rules.counting == "simultaneous":
+        counted_ = [scip.addVar(vtype="B") for _ in range(n_c)]
+        for i in range(n):
+            scip.addCons(on[i] <= counted_[i // m])
+    if rules.max_moves is not None:
+        scip.addCons(pyscipopt.quicksum(counted_) <= rules.max_moves)
+    for first in range(n - (rules.dwell - 1) * m):
+        if rules.dwell > 1:
+            scip.addCons(pyscipopt.quicksum(on[first + k * m] for k in range(rules.dwell)) <= 1)
+    # 1/2 z' H z = 1/2 |L' z|^2 <= curved
+    curved, roots = scip.addVar(lb=None), [scip.addVar(lb=None) for _ in z]
+    for column, root in zip(np.linalg.cholesky(program.H).T, roots, strict=True):
+        scip.addCons(pyscipopt.quicksum(column[i] * z[i] for i in np.flatnonzero(column)) == root)
+    scip.addCons(pyscipopt.quicksum(0.5 * root * root for root in roots) <= curved)
+    linear = pyscipopt.quicksum(program.f[i] * z[i] for i in range(l + n))
+    scip.setObjective(curved + linear + rules.price * pyscipopt.quicksum(counted_))
+    scip.optimize()
+    return program.constant + scip.getDualbound(), program.constant + scip.getObjVal()

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import mampc
-from builders import predicted, random_model
+from builders import cost_of, predicted, random_model
 from mampc import Status
 from mampc.condensing import CondensedQP
 from mampc.controllers import ranking
-from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of
+from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
 
 SEEDS = range(300)
 RULES = ("max_moves", "price", "min_size", "dwell", "max_moves_per_step", "blocks")
@@ -157,3 +157,124 @@ def test_each_bookkeeping_is_what_it_says(monkeypatch):
         search = mampc.Exact().prepare(CondensedQP(random_case(0).problem), random_case(0).rules)
         names.append((name, search._ranking is None))
     assert names == [("ranking", False), ("tree", True)]
+
+
+def larger_case(seed):
+    """16 to 24 moves within limits of all kinds, from rest."""
+    rng = np.random.default_rng(seed)
+    n_c, m = [(8, 2), (20, 1), (7, 3), (12, 2)][seed % 4]
+    model = random_model(seed, n=4, m=m, l=m, radius=rng.uniform(0.6, 0.95))
+    rules = mampc.MoveRules(
+        price=float(10 ** rng.uniform(-1, 1)) if seed % 3 != 1 else 0.0,
+        max_moves=int(rng.integers(2, 5)) if seed % 3 != 0 else None,
+        counting=["elementwise", "simultaneous"][seed // 2 % 2],
+        dwell=int(rng.integers(1, 4)),
+    )
+    limits = mampc.Limits(
+        u_min=model.u_op - 1.5, u_max=model.u_op + 1.5, du_max=rng.uniform(1, 2, m),
+        y_max=model.y_op + rng.uniform(1, 4, m),
+    )  # fmt: skip
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=n_c + 4, control_horizon=n_c, limits=limits, output_limit_weight=10.0
+    )
+    past = np.tile(model.u_op, (rules.memory, 1))
+    return Case(problem, rules, past, rng.standard_normal(4), model.y_op + 2 * rng.standard_normal(m))
+
+
+def test_scip_brackets_the_optimum_of_larger_problems():
+    both = 0
+    for seed in range(60):
+        problem, rules, past, x, reference = case = larger_case(seed)
+        decision = decide(case)
+        low, high = scip_bounds(problem, rules, x, past[-1], reference, seconds=0.7)
+        tolerance = 1e-6 * abs(decision.objective)
+        assert decision.lower_bound <= high + tolerance, seed
+        assert decision.objective >= low - tolerance, seed
+        if decision.status is Status.OPTIMAL:
+            assert decision.objective <= high + tolerance, seed
+            both += high - low <= tolerance
+        assert_keeps_limits_and_rules(case, decision)
+    assert both >= 10
+
+
+@pytest.mark.parametrize("seed", range(1, 11))
+@pytest.mark.parametrize("table", [0, 3_000_000])
+def test_out_of_time_the_best_plan_so_far_comes_with_a_valid_bound(seed, table, monkeypatch):
+    monkeypatch.setattr(ranking, "LARGEST_TABLE", table)
+    case = larger_case(seed)
+    optimum = decide(case, time_limit=20.0)
+    assert optimum.status is Status.OPTIMAL
+    limits = (1e-6, 1e-3, 3e-3, 1e-2)
+    decisions = [decide(case, time_limit=limit) for limit in limits]
+    assert decisions[0].status in (Status.TIME_LIMIT, Status.OPTIMAL)
+    for decision, limit in zip(decisions, limits, strict=True):
+        tolerance = 1e-9 * optimum.objective
+        assert decision.lower_bound <= optimum.objective + tolerance
+        assert decision.objective >= optimum.objective - tolerance
+        assert (decision.status is Status.OPTIMAL) == (decision.gap == 0)
+        assert decision.solve_time < limit + 0.2
+        assert_keeps_limits_and_rules(case, decision)
+
+
+@pytest.mark.parametrize("least_size", [0.0, 0.3])
+def test_the_time_limit_is_kept_where_the_proof_is_out_of_reach(least_size):
+    model = random_model(3, n=4, m=4, l=4)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=44, control_horizon=40, output_limit_weight=10.0,
+        limits=mampc.Limits(u_min=model.u_op - 1, u_max=model.u_op + 1, y_max=model.y_op + 0.5),
+    )  # fmt: skip
+    rules = mampc.MoveRules(price=0.3, dwell=3, min_size=least_size)
+    case = Case(problem, rules, np.tile(model.u_op, (3, 1)), np.ones(4), model.y_op + 1.0)
+    decision = decide(case, time_limit=0.3)
+    assert decision.status is Status.TIME_LIMIT
+    assert decision.solve_time < 0.3 * 1.2 + 0.1
+    assert np.isfinite(decision.lower_bound)
+    assert decision.lower_bound < decision.objective
+    assert_keeps_limits_and_rules(case, decision)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_rules_that_forbid_nothing_give_plain_mpc_and_those_that_forbid_all_hold(seed, monkeypatch):
+    problem, _, past, x, reference = random_case(seed)
+    plain = mampc.MPC(problem)
+    dense = plain.step(plain.initial_state(past), x, reference)
+    for _ in both_bookkeepings(monkeypatch):
+        free = decide(Case(problem, mampc.MoveRules(max_moves=100), past, x, reference))
+        np.testing.assert_allclose(free.plan, dense.plan, atol=1e-6)
+        assert free.objective == pytest.approx(dense.objective, rel=1e-9)
+        for rules in (
+            {"max_moves": 0}, {"max_moves": 0, "counting": "simultaneous", "dwell": 2}, {"price": 1e9},
+            {"price": 1e9, "counting": "simultaneous"}, {"min_size": 0.01, "price": 1e9},
+        ):  # fmt: skip
+            held = decide(Case(problem, mampc.MoveRules(**rules), past, x, reference))
+            assert held.status is Status.OPTIMAL
+            assert not held.moves.any()
+            assert (held.plan == past[-1]).all()
+            assert held.objective == pytest.approx(cost_of(problem, x, past[-1], reference, held.plan))
+
+
+@pytest.mark.parametrize("method", [name for name in mampc.METHODS if name != "exact"])
+def test_other_methods_certified_report_a_valid_bound_and_an_objective_as_planned(method):
+    settings = {"warm_up": 0, "polish": True} if method == "alternating" else {}
+    proven = 0
+    for seed in range(0, len(SEEDS), 4):
+        problem, rules, past, x, reference = case = random_case(seed)
+        best = best_value(seed, rules)
+        plain, certified = decide(case, method, **settings), decide(case, method, certify=True, **settings)
+        assert plain.lower_bound == -np.inf
+        np.testing.assert_allclose(plain.plan, certified.plan, atol=1e-9)
+        assert certified.lower_bound == pytest.approx(best, rel=1e-6)
+        assert certified.objective >= best * (1 - 1e-6)
+        assert certified.objective == pytest.approx(
+            objective_of(problem, rules, x, past, reference, certified.plan), rel=1e-6
+        )
+        assert (certified.status is Status.OPTIMAL) == (certified.gap == 0)
+        proven += certified.status is Status.OPTIMAL
+        assert_keeps_limits_and_rules(case, certified)
+    assert proven >= 10
+
+
+def test_without_polish_the_bound_is_that_of_exactly_sparse_plans():
+    case = random_case(0)
+    decision = decide(case, "alternating", warm_up=0, certify=True)
+    assert decision.lower_bound == pytest.approx(best_value(0, case.rules), rel=1e-6)

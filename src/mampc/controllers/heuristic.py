@@ -112,13 +112,13 @@ class HeuristicSearch:
         if self._referee is None:
             return plan
         proof = self._referee.plan(instance, state)
-        if proof.objective is None or plan.objective is None:
-            return plan
         bound = proof.objective if proof.lower_bound is None else proof.lower_bound
+        if (
+            plan.objective is None or bound is None
+        ):  # moves off the pattern are not zero: nothing to prove best
+            return plan._replace(lower_bound=bound)
         if plan.status is Status.FEASIBLE and plan.objective - bound <= 10 * TIE * max(
             1e-6, instance.constant
         ):
             return plan._replace(status=Status.OPTIMAL, lower_bound=None)
-        return plan._replace(
-            lower_bound=min(bound, plan.objective) if plan.status is Status.FEASIBLE else bound
-        )
+        return plan._replace(lower_bound=min(bound, plan.objective))

@@ -129,7 +129,7 @@ class PatternSolver:
             return OnPattern(
                 None, np.inf if status is QPStatus.INFEASIBLE else least, status, multipliers, iterations
             )
-        moves = np.zeros(n)
+        moves: Array = np.zeros(n)
         moves[pattern] = best
         if len(best) and np.abs(best).min() < SMALLER:
             moves = self._without_rounding(instance, moves)
