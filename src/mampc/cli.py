@@ -1,4 +1,4 @@
-"""The command line: `mampc run`, `reproduce`, `new`, `identify`."""
+"""The command line: `mampc run`, `replay`, `reproduce`, `new`, `identify`."""
 
 from __future__ import annotations
 
@@ -88,6 +88,42 @@ def run(
     if missing is not None:
         _complain(f"note: no figures written; {missing}")
     console.print(f"Results are in {directory}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def replay(
+    run: Annotated[
+        Path, typer.Argument(help="A trajectory that `mampc run` wrote, SCENARIO_CONTROLLER.csv.")
+    ],
+    study: Annotated[
+        str, typer.Option("--study", "-s", help="The study it came from: a name or a TOML file.")
+    ],
+    tolerance: Annotated[
+        float, typer.Option(help="Of inputs and objectives, relative to their size; 0 for the same bits.")
+    ] = 1e-9,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
+    ] = False,
+) -> None:
+    """Decide again on the recorded measurements of a run, and find the first decision that differs.
+
+    The model is the model.json beside the run, if there is one, else it is identified again. Exits with 0 if
+    every decision comes out as recorded, with 1 if one differs.
+
+    Example:
+
+        mampc replay results/quadruple-tank/noisy_exact-price.csv --study quadruple-tank
+    """
+    from mampc.report.replaying import replay_trajectory
+    from mampc.study import load_study
+
+    plan = load_study(study, trust=True if trust else None)
+    with _progress() as show:
+        samples, difference = replay_trajectory(run, plan, tolerance, show)
+    if difference is not None:
+        _console().print(f"{run}: the first difference is at {difference}", soft_wrap=True, markup=False)
+        raise typer.Exit(1)
+    _console().print(f"{run}: all {samples} decisions come out as recorded", soft_wrap=True, markup=False)
 
 
 @app.command()

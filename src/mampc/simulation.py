@@ -20,7 +20,7 @@ from mampc.lti import StateSpace
 from mampc.metrics import Metrics
 from mampc.names import Names
 from mampc.plants import Plant, advance
-from mampc.regulator import Regulator
+from mampc.regulator import Regulator, RegulatorState
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -154,10 +154,8 @@ def simulate(
     start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
 
     output, move, faults = _sampled(plant, model.dt)
-    x = plant.steady_state(np.concatenate([start, v[0]]))
     told: list[dict[str, Any]] = [{"measured_disturbance": now} if model.n_disturbances else {} for now in v]
-    y = output(x, np.concatenate([start, v[0]]))
-    state = regulator.initial_state(start, y, **told[0])
+    x, state = at_rest(plant, regulator, start, v[0])
     inputs, outputs, decisions, found = np.empty((T, m)), np.empty((T, l)), [], {}
     u = start
     for k in _watched(T, progress):
@@ -175,6 +173,19 @@ def simulate(
         t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + wobble, r=r, u_initial=start,
         decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found,
     )  # fmt: skip
+
+
+def at_rest(
+    plant: Plant | StateSpace, regulator: Regulator, u: Array, v: Array
+) -> tuple[Array, RegulatorState]:
+    """The states of plant and regulator before the first sample, at rest under inputs u (m,) and measured
+    disturbances v (d,).
+    """
+    model, both = regulator.controller.problem.model, np.concatenate([u, v])
+    x = plant.steady_state(both)
+    y = _sampled(plant, model.dt)[0](x, both)
+    told = {"measured_disturbance": v} if model.n_disturbances else {}
+    return x, regulator.initial_state(u, y, **told)
 
 
 def _length(reference: Any, steps: int | None) -> int:

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from mampc.arrays import Array, as_array, as_matrix, as_number, as_vector, as_whole
+from mampc.csv_table import CSVTable
 from mampc.errors import MampcError
 from mampc.files import written_whole
 from mampc.lti import StateSpace
 from mampc.names import Names, require_count
 from mampc.plants import Plant, advance
-
-CSV_FILE_LIMIT = 1 << 30  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,22 +105,17 @@ class IOData:
             MampcError: a missing column, an empty or ragged file, a field that is not a number, or
                 an uneven `time` column where dt is taken from it.
         """
-        header, rows = _read_csv(Path(path))
+        table = CSVTable(path)
         given = [
             (group,) if isinstance(group, str) else tuple(group) for group in (inputs, outputs, disturbances)
         ]
         names = Names(given[0], given[1], disturbances=given[2])
         all_inputs = names.inputs + names.disturbances
-        columns = {}
-        for name in (*all_inputs, *names.outputs, *(["time"] if dt is None else [])):
-            if header.count(name) != 1:
-                hint = "; pass dt (--dt)" if name == "time" else ""
-                raise MampcError(f"{path}: expected one column {name!r}, received columns {header}{hint}")
-            columns[name] = _numbers(Path(path), rows, header.index(name), name)
+        columns = {name: table.numbers(name) for name in (*all_inputs, *names.outputs)}
         if dt is None:
-            dt = _even_step(path, columns["time"])
+            dt = _even_step(path, table.numbers("time", "; pass dt (--dt)"))
         u, y = (
-            np.array([columns[name] for name in group]).reshape(len(group), len(rows)).T
+            np.array([columns[name] for name in group]).reshape(len(group), len(table)).T
             for group in (all_inputs, names.outputs)
         )
         return cls(u, y, dt, names)
@@ -185,43 +179,6 @@ def _listed(names: Sequence[str]) -> tuple[str, ...]:
 def _column(name: str, value: Any) -> Array:
     array = as_array(name, value)
     return as_matrix(name, array[:, None] if array.ndim == 1 else array)
-
-
-def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The header, and the other rows with the number of their line."""
-    try:
-        if path.stat().st_size > CSV_FILE_LIMIT:
-            raise MampcError(
-                f"{path}: expected at most {CSV_FILE_LIMIT} bytes, received {path.stat().st_size}"
-            )
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            lines = [(reader.line_num, [field.strip() for field in row]) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MampcError(f"{path}: expected a readable CSV file, received: {error}") from None
-    if len(lines) < 2:
-        raise MampcError(
-            f"{path}: expected a header and at least one row of numbers, received {len(lines)} rows"
-        )
-    header, rows = lines[0][1], lines[1:]
-    for number, row in rows:
-        if len(row) != len(header):
-            raise MampcError(f"{path}: expected {len(header)} fields in row {number}, received {len(row)}")
-    return header, rows
-
-
-def _numbers(path: Path, rows: list[tuple[int, list[str]]], column: int, name: str) -> Array:
-    values = np.empty(len(rows))
-    for i, (number, row) in enumerate(rows):
-        try:
-            values[i] = float(row[column])
-        except ValueError:
-            values[i] = np.nan
-        if not np.isfinite(values[i]):
-            raise MampcError(
-                f"{path}: expected a number in row {number}, column {name!r}, received {row[column]!r}"
-            )
-    return values
 
 
 def _even_step(path: str | Path, time: Array) -> float:

@@ -20,10 +20,10 @@ from mampc.lti import StateSpace
 from mampc.patterns import MoveRules
 from mampc.plants import Plant
 from mampc.problem import Limits, TrackingProblem
-from mampc.regulator import Regulator
+from mampc.regulator import Regulator, RegulatorState
 from mampc.sensors import SensorChecks
 from mampc.signals import prbs, steps
-from mampc.simulation import Run, simulate
+from mampc.simulation import Run, at_rest, simulate
 from mampc.study.plugins import make_plant
 from mampc.study.schema import (
     ControllerTable,
@@ -99,14 +99,17 @@ def run_study(
     return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings)
 
 
-def prepare(study: Study, on_stage: Callable[[str], None] = lambda stage: None) -> Prepared:
-    """The plant of a study, and a model of it: read from a file, or identified from an excitation.
+def prepare(
+    study: Study, on_stage: Callable[[str], None] = lambda stage: None, model: StateSpace | None = None
+) -> Prepared:
+    """The plant of a study, and a model of it: given, read from a file, or identified from an excitation.
 
     Raises:
         MampcError: values of the study that do not fit its plant or model.
     """
-    if study.model is not None:
+    if model is None and study.model is not None:
         model = StateSpace.load(_inside(study._folder, study.model.file))
+    if model is not None:
         if not np.isclose(model.dt, study.dt, rtol=1e-6):
             raise StudyError(f"dt: expected the model's {model.dt:g} s, received {study.dt:g} s")
         plant = model if study.plant.kind == "model" else make_plant(study)
@@ -131,18 +134,13 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
 
 def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator) -> Run:
     """One controller in one scenario of a study."""
-    model, plant, at, T = prepared.model, prepared.plant, scenario.disturbance_at, study.steps
+    model = prepared.model
 
     def disturbance(value: Values | None, usual: Any) -> Any:
-        if value is None:
-            return None
-        try:
-            return steps(T, usual, [(at, value)])
-        except MampcError as error:
-            raise StudyError(f"scenarios, {scenario.name!r}, disturbances: {error}") from None
+        return None if value is None else _disturbance(study, scenario, value, usual)
 
     return simulate(
-        plant,
+        prepared.plant,
         regulator,
         _reference(study, prepared),
         noise=scenario.noise,
@@ -154,6 +152,24 @@ def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, re
         u_initial=prepared.u_op,
         progress=False,
     )
+
+
+def initial_state(
+    study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator
+) -> RegulatorState:
+    """The state from which `run_controller` starts."""
+    v = prepared.v_op
+    if scenario.measured_disturbance is not None:
+        v = _disturbance(study, scenario, scenario.measured_disturbance, v)[0]
+    return at_rest(prepared.plant, regulator, prepared.u_op, v)[1]
+
+
+def _disturbance(study: Study, scenario: ScenarioTable, value: Values, usual: Any) -> Array:
+    """A disturbance that takes a value at the scenario's sample, one row per sample."""
+    try:
+        return steps(study.steps, usual, [(scenario.disturbance_at, value)])
+    except MampcError as error:
+        raise StudyError(f"scenarios, {scenario.name!r}, disturbances: {error}") from None
 
 
 def _problem(study: Study, model: StateSpace) -> TrackingProblem:

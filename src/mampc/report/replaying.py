@@ -1,0 +1,37 @@
+"""`mampc replay`: a recorded trajectory decided again, by the regulator that its study describes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from mampc.errors import MampcError
+from mampc.lti import StateSpace
+from mampc.replay import Difference, Recording, replay
+from mampc.report.output import trajectories
+from mampc.study import Study
+from mampc.study.running import initial_state, prepare, regulator_of
+
+
+def replay_trajectory(
+    path: Path, study: Study, tolerance: float, on_stage: Callable[[str], None] = lambda stage: None
+) -> tuple[int, Difference | None]:
+    """Replay a file of `mampc run`; returns its number of samples and the first difference, if any.
+
+    Raises:
+        MampcError: a file that is not named as a trajectory of the study, or cannot be read.
+    """
+    files = {name: (scenario, controller) for scenario, controller, name in trajectories(study)}
+    if path.name not in files:
+        raise MampcError(f"replay: expected a file named one of {', '.join(files)}, received {path.name}")
+    scenario_name, controller_name = files[path.name]
+    scenario = next(table for table in study.scenarios if table.name == scenario_name)
+    controller = next(table for table in study.controllers if table.name == controller_name)
+    beside = path.with_name("model.json")
+    prepared = prepare(study, on_stage, StateSpace.load(beside) if beside.is_file() else None)
+    regulator = regulator_of(study, prepared.model, controller)
+    recording = Recording.from_csv(path, prepared.plant.names)
+    on_stage(f"replaying {len(recording.t)} samples")
+    state = initial_state(study, prepared, scenario, regulator)
+    difference = replay(regulator, state, recording, preview=study.reference.preview, tolerance=tolerance)
+    return len(recording.t), difference
