@@ -81,7 +81,7 @@ class ExactSearch:
         if ranking is None:
             return self._search_tree(instance, past)
         bounds = ranking.bounds(instance.f_moves, past)
-        best = int(bounds.argmin())
+        best = ranking.rows(past).start + int(bounds.argmin())
         if not self.admissible.sized:
             optimum = ranking.optimum(best, instance)
             margins = optimum.margins
@@ -98,7 +98,7 @@ class ExactSearch:
 
     def _search_ranking(self, ranking: Ranking, bounds: Array, instance: Instance, past: Past) -> Plan:
         """Patterns of the table best bound first, ranked again with the multipliers of each program solved."""
-        best, deadline = Incumbent(), self._deadline()
+        best, deadline, patterns = Incumbent(), self._deadline(), ranking.patterns[ranking.rows(past)]
         bounds += instance.constant
         tie = TIE * max(1e-6, instance.constant)
         while True:
@@ -108,7 +108,7 @@ class ExactSearch:
                 return self._plan(instance, best, best.objective)
             if perf_counter() > deadline:
                 return self._plan(instance, best, bound, Status.TIME_LIMIT)
-            solved = self._solver.solve(instance, ranking.patterns[index], best.objective, deadline)
+            solved = self._solver.solve(instance, patterns[index], best.objective, deadline)
             best.offer(solved)
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(instance, best, bound, Status.TIME_LIMIT)

@@ -37,7 +37,11 @@ class Ranking:
         counts = np.array([admissible.count(pattern) for pattern in patterns])
         order = np.argsort(counts, kind="stable")
         self.patterns: BoolArray = patterns[order]
-        self._ends = np.searchsorted(counts[order], np.arange(counts.max() + 1), side="right").tolist()
+        ends = np.searchsorted(counts[order], np.arange(counts.max() + 1), side="right").tolist()
+        # A free move more never costs more: then only patterns that spend the whole budget are of interest.
+        nested = admissible.simple and not admissible.priced and not admissible.sized
+        starts = [0, *ends[:-1]] if nested else [0] * len(ends)
+        self._rows_within = [slice(start, end) for start, end in zip(starts, ends, strict=True)]
         self.charge = np.array([admissible.charge(pattern) for pattern in self.patterns])
         n = condensed.n_moves
         self._rows, self._columns = np.triu_indices(n)
@@ -54,19 +58,23 @@ class Ranking:
         self._kept: OrderedDict[int, PatternOptimum] = OrderedDict()
         self._most_kept = max(64, int(CACHE_BYTES / condensed.map_bytes))
 
-    def bounds(self, f: Array, past: Past) -> Array:
-        """A lower bound per admissible pattern (infinite where the past forbids it), for the linear term f.
+    def rows(self, past: Past) -> slice:
+        """Where the patterns stand among which the best one is, given the past."""
+        return self._rows_within[min(past.left, len(self._rows_within) - 1)]
 
-        Relative to the cost of no moves; shape (at most K,), in the order of `patterns`.
+    def bounds(self, f: Array, past: Past) -> Array:
+        """A lower bound for each pattern of `rows` (infinite where the past forbids it), for the linear term f.
+
+        Relative to the cost of no moves.
         """
-        end = self._ends[min(past.left, len(self._ends) - 1)]
-        values: Array = self._table[:end].dot(f.take(self._rows) * f.take(self._columns))
+        rows = self.rows(past)
+        values: Array = self._table[rows].dot(f.take(self._rows) * f.take(self._columns))
         if self.admissible.priced:
-            values += self.charge[:end]
+            values += self.charge[rows]
         if self.admissible.sized:
-            values += self._lift(f, end)
+            values += self._lift(f, rows.stop)
         if any(past.rest):
-            values[(self.patterns[:end] & ~self.admissible.open(past)).any(axis=1)] = np.inf
+            values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
         return values
 
     def _lift(self, f: Array, end: int) -> Array:
