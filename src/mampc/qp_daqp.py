@@ -22,6 +22,7 @@ _STATUS = {
     -4: QPStatus.ITERATION_LIMIT,
     -7: QPStatus.TIME_LIMIT,
 }
+ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
 
 
@@ -29,7 +30,9 @@ class DaqpSolver:
     """Solves one `QuadraticProgram` again and again for new f and bounds.
 
     Safe to share between threads (each gets its own daqp workspace) and to pickle (the workspace is
-    rebuilt). A failed solve throws the workspace away, so that it cannot spoil the next one.
+    rebuilt). A failed solve throws the workspace away, so that it cannot spoil the next one. A
+    solve starts from the active bounds of the last one, which shows in the last digits of its answer; `start`
+    begins a sequence whose answers depend on its data alone.
 
     Args:
         program: the constant part.
@@ -49,10 +52,12 @@ class DaqpSolver:
             "iter_limit": iteration_limit,
             "time_limit": 0.0 if time_limit is None else time_limit,
         }
+        self._inactive = np.zeros(program.n_bounds)
         self._f_shape = (program.n_variables,)
         self._bound_shape = (program.n_bounds,)
         self._local = threading.local()
         self._local.model = self._fresh_model() if program.n_bounds else None
+        self._local.active = None
 
     def solve(self, f: Array, lower: Array, upper: Array) -> QPSolution:
         """Minimise for the linear term f, shape (n,), and bounds, shape (n_simple + rows,).
@@ -75,8 +80,16 @@ class DaqpSolver:
         model = getattr(self._local, "model", None)
         if model is None:
             model = self._local.model = self._fresh_model()
+            self._local.active = getattr(self._local, "active", None)
         # daqp reads memory as contiguous doubles and keeps references to it: hand it copies of its own.
-        flag = model.update(f=_own(f), blower=_own(lower), bupper=_own(upper))
+        active, self._local.active = self._local.active, None
+        if active is None:
+            flag = model.update(f=_own(f), blower=_own(lower), bupper=_own(upper))
+        else:
+            # A bound that went away since cannot be started from.
+            there = np.where(active == ACTIVE_BELOW, lower > -UNBOUNDED, upper < UNBOUNDED)
+            sense = np.where(there, active, 0).astype(np.intc)
+            flag = model.update(f=_own(f), blower=_own(lower), bupper=_own(upper), sense=sense)
         if flag < 0:
             self._local.model = None
             return _BAD_DATA
@@ -85,6 +98,10 @@ class DaqpSolver:
             self._local.model = None
             return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
         return QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
+
+    def start(self, active: Array | None = None) -> None:
+        """Begin anew: the next solve starts from these active bounds, as `active_bounds` gives them, default none."""
+        self._local.active = self._inactive if active is None else active
 
     def _fresh_model(self) -> Any:
         import daqp
@@ -111,6 +128,12 @@ class DaqpSolver:
             time_limit=settings["time_limit"] or None,
             iteration_limit=settings["iter_limit"],
         )
+
+
+def active_bounds(multipliers: Array) -> Array:
+    """Which bounds hold a solution with these multipliers: 1 at an upper, 3 at a lower bound, else 0."""
+    active: Array = (multipliers > 0) + ACTIVE_BELOW * (multipliers < 0)
+    return active.astype(np.float64)
 
 
 def _own(array: Array) -> Array:

@@ -108,7 +108,16 @@ class Regulator:
                 numbers["measured_disturbance"],
                 SensorState(**numbers["sensors"]),
             )
-            received, expected = _shapes(state), _shapes(self.initial_state())
+            shape = (self.controller.problem.control_horizon, *state.controller.inputs.shape[1:])
+            started = replace(
+                self.initial_state().controller,
+                guess=None if state.controller.guess is None else np.zeros(shape),
+                active=None
+                if state.controller.active is None
+                else np.zeros(self.controller.condensed.program.n_bounds),
+            )
+            received = _shapes(state)
+            expected = _shapes(replace(self.initial_state(), controller=started))
         except MampcError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
@@ -222,7 +231,6 @@ def _shapes(state: RegulatorState) -> dict[str, Any]:
         f"{part}.{name}": np.shape(value)
         for part, content in asdict(state).items()
         for name, value in (content.items() if isinstance(content, dict) else [("value", content)])
-        if name != "guess"
     }
 
 

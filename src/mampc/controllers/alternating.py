@@ -183,6 +183,7 @@ class FirstStep:
     def begin(self, instance: Instance) -> Sample:
         """What the rounds of one sample share."""
         v = self._violations
+        self._solver.start()
         start = -(self._inverse @ instance.f_moves)
         return Sample(
             start, instance.f, instance.lower, instance.upper, instance.lower[v:], instance.upper[v:]

@@ -19,7 +19,7 @@ from mampc.instance import Instance
 from mampc.patterns import MoveRules
 from mampc.problem import Limits, TrackingProblem
 from mampc.qp import QPStatus
-from mampc.qp_daqp import DaqpSolver
+from mampc.qp_daqp import DaqpSolver, active_bounds
 
 HELD_BY = {
     QPStatus.INFEASIBLE: Status.HELD_INFEASIBLE,
@@ -48,6 +48,7 @@ class Plan(NamedTuple):
     inputs: Array | None = None
     objective: float | None = None
     remarks: tuple[Remark, ...] = ()
+    active: Array | None = None
 
 
 class Controller(ABC):
@@ -209,7 +210,7 @@ class Controller(ABC):
         present: PresentLimits | None,
         start: float,
     ) -> Decision:
-        moves, status, iterations, lower_bound, guess, inputs, objective, remarks = plan
+        moves, status, iterations, lower_bound, guess, inputs, objective, remarks, active = plan
         if moves is None or instance is None:
             moves = np.zeros(self.condensed.n_moves)
             objective, lower_bound = np.nan, -np.inf
@@ -249,10 +250,10 @@ class Controller(ABC):
         history = inputs[:1] if len(history) == 1 else np.concatenate((history[1:], inputs[:1]))
         return Decision(
             u, inputs, changes, status, objective, lower_bound, iterations,
-            perf_counter() - start, ControllerState(history, state.samples + 1, guess), remarks, violations,
+            perf_counter() - start, ControllerState(history, state.samples + 1, guess, active), remarks, violations,
         )  # fmt: skip
 
-    def _unrestricted(self, instance: Instance) -> Plan:
+    def _unrestricted(self, instance: Instance, state: ControllerState) -> Plan:
         """Plain MPC: every move is free. Where no limit is active the optimum is at hand already."""
         if instance.manual is not None:
             return self._but_for_manual(instance, instance.manual)
@@ -262,10 +263,14 @@ class Controller(ABC):
                 instance.moves, Status.OPTIMAL, 0, None, None,
                 instance.inputs, instance.cost,
             )  # fmt: skip
+        self._solver.start(state.active)
         solution = self._solver.solve(instance.f, instance.lower, instance.upper)
-        if solution.z is None:
+        if solution.z is None or solution.multipliers is None:
             return Plan(None, HELD_BY[solution.status], solution.iterations)
-        return Plan(solution.z[self.condensed.n_violations :], Status.OPTIMAL, solution.iterations, None)
+        return Plan(
+            solution.z[self.condensed.n_violations :], Status.OPTIMAL, solution.iterations, None,
+            active=active_bounds(solution.multipliers),
+        )  # fmt: skip
 
     def _but_for_manual(self, instance: Instance, manual: BoolArray) -> Plan:
         """Plain MPC of the inputs that are not in manual."""

@@ -158,6 +158,7 @@ class Sample:
     ) -> None:
         self._condensed, self._solver, self._relaxation = search.condensed, search._solver, search._relaxation
         self._instance, self._best, self._deadline, self._tie = instance, best, deadline, tie
+        self._relaxation.begin()
 
     def leaf(self, pattern: BoolArray) -> tuple[float, Priced | None]:
         solved = self._solver.solve(self._instance, pattern, self._best.objective, self._deadline)

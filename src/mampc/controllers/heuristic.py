@@ -95,6 +95,7 @@ class HeuristicSearch:
             return instance.f_moves
         if self._relaxed is None:
             self._relaxed = DaqpSolver(self.condensed.program)
+        self._relaxed.start()
         solution = self._relaxed.solve(instance.f, instance.lower, instance.upper)
         if solution.multipliers is None:
             return instance.f_moves

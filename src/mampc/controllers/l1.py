@@ -75,6 +75,7 @@ class L1Search(HeuristicSearch):
         proposed: dict[bytes, BoolArray] = {}
         largest, rounds = np.abs(instance.moves).max(), 0
         c = np.ones(self.condensed.n_moves)
+        self._program.start()
         for _ in range(self.settings.reweightings + 1):
             d, programs = self._weighed(instance, past, c, ZERO * largest, proposed)
             rounds += programs

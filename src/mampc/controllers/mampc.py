@@ -134,16 +134,16 @@ class MAMPC(Controller):
     def _plan(self, instance: Instance, state: ControllerState) -> Plan:
         search = self._search
         if search is None:
-            return self._unrestricted(instance)
+            return self._unrestricted(instance, state)
         if state.samples >= search.warm_up:
             plan = _without_rounding(search.plan(instance, state))
-            return plan if self._margin is None else self._unless_urgent(plan, instance, self._margin)
-        plan = self._unrestricted(instance)
+            return plan if self._margin is None else self._unless_urgent(plan, instance, state, self._margin)
+        plan = self._unrestricted(instance, state)
         if plan.moves is None:
             return plan
         return plan._replace(status=Status.WARM_UP, lower_bound=-np.inf, objective=None)
 
-    def _unless_urgent(self, plan: Plan, instance: Instance, margin: Array) -> Plan:
+    def _unless_urgent(self, plan: Plan, instance: Instance, state: ControllerState, margin: Array) -> Plan:
         """The plan, or that of plain MPC where the rules would cost a violation beyond the margin."""
         if not self.condensed.n_violations:
             return plan
@@ -151,7 +151,7 @@ class MAMPC(Controller):
         violations = self.condensed.violations(instance, moves)
         if not (violations > margin).any():
             return plan
-        urgent = self._unrestricted(instance)
+        urgent = self._unrestricted(instance, state)
         if urgent.moves is None:
             return plan
         lower = self.condensed.violations(instance, urgent.moves) < violations - URGENT

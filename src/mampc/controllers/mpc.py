@@ -21,4 +21,4 @@ class MPC(Controller):
     """
 
     def _plan(self, instance: Instance, state: ControllerState) -> Plan:
-        return self._unrestricted(instance)
+        return self._unrestricted(instance, state)

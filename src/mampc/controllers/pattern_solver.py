@@ -58,8 +58,34 @@ class Incumbent:
         return True
 
 
+class Prepared:
+    """What the programs on one pattern share: the optimum without limits, and a solver for the rest."""
+
+    def __init__(self, condensed: CondensedQP, pattern: BoolArray) -> None:
+        self._condensed, self._pattern = condensed, pattern
+        self.chosen = np.flatnonzero(pattern)
+        self._minus_inverse = -np.linalg.inv(condensed.H[self.chosen[:, None], self.chosen])
+        self._rows = condensed.bounded_rows[:, self.chosen]
+        self._solver: tuple[Restriction, DaqpSolver] | None = None
+
+    def unlimited(self, f_moves: Array, lower: Array, upper: Array, sizes: Array | None) -> Array | None:
+        """The optimum without limits, shape (moves of the pattern,), if it keeps all limits and least sizes."""
+        d: Array = self._minus_inverse @ f_moves[self.chosen]
+        rows = self._rows @ d
+        inside = (rows >= lower).all() and (rows <= upper).all()
+        return d if inside and (sizes is None or (np.abs(d) >= sizes).all()) else None
+
+    @property
+    def solver(self) -> tuple[Restriction, DaqpSolver]:
+        """The restricted program and its solver, set up when first wanted."""
+        if self._solver is None:
+            restriction = self._condensed.restricted(self._pattern)
+            self._solver = restriction, DaqpSolver(restriction.program)
+        return self._solver
+
+
 class PatternSolver:
-    """Solves the condensed program on one pattern at a time, keeping recent solvers warm.
+    """Solves the condensed program on one pattern at a time, keeping what recent patterns took to prepare.
 
     Where moves have a least size, each must be at most -size or at least +size: a small search over
     signs, those of the optimum without least sizes first.
@@ -67,7 +93,7 @@ class PatternSolver:
 
     def __init__(self, condensed: CondensedQP, admissible: Admissible) -> None:
         self.condensed, self.admissible = condensed, admissible
-        self._kept: OrderedDict[bytes, tuple[Restriction, DaqpSolver]] = OrderedDict()
+        self._kept: OrderedDict[bytes, Prepared] = OrderedDict()
 
     def solve(
         self, instance: Instance, pattern: BoolArray, cutoff: float = np.inf, deadline: float = np.inf
@@ -86,13 +112,20 @@ class PatternSolver:
         v, n = self.condensed.n_violations, self.condensed.n_moves
         if not pattern.any() and not v:
             return OnPattern(np.zeros(n) if base < cutoff else None, base, QPStatus.OPTIMAL, None, 0)
-        unlimited = None if pattern.tobytes() in self._kept else self._unlimited(instance, pattern)
-        if unlimited is not None:
-            objective = base + 0.5 * float(instance.f_moves.dot(unlimited))
-            return OnPattern(unlimited if objective < cutoff else None, objective, QPStatus.OPTIMAL, None, 0)
-        (program, columns, bounds), solver = self._solver(pattern)
+        prepared, sizes = self._prepared(pattern), self.admissible.min_size[pattern]
+        d = prepared.unlimited(
+            instance.f_moves, instance.lower[v:], instance.upper[v:], sizes if self.admissible.sized else None
+        )
+        if d is not None:
+            objective = base + 0.5 * float(instance.f_moves[prepared.chosen].dot(d))
+            moves: Array | None = None
+            if objective < cutoff:
+                moves = np.zeros(n)
+                moves[prepared.chosen] = d
+            return OnPattern(moves, objective, QPStatus.OPTIMAL, None, 0)
+        (program, columns, bounds), solver = prepared.solver
+        solver.start()
         f, H = instance.f[columns], program.H
-        sizes = self.admissible.min_size[pattern]
         best, least, status = None, cutoff, QPStatus.INFEASIBLE
         multipliers, iterations, pending = None, 0, [(every_lower[bounds], every_upper[bounds])]
         while pending:
@@ -129,7 +162,7 @@ class PatternSolver:
             return OnPattern(
                 None, np.inf if status is QPStatus.INFEASIBLE else least, status, multipliers, iterations
             )
-        moves: Array = np.zeros(n)
+        moves = np.zeros(n)
         moves[pattern] = best
         if len(best) and np.abs(best).min() < SMALLER:
             moves = self._without_rounding(instance, moves)
@@ -152,19 +185,6 @@ class PatternSolver:
                 best.offer(self.solve(instance, fewer, best.objective, deadline))
         return solved
 
-    def _unlimited(self, instance: Instance, pattern: BoolArray) -> Array | None:
-        """The optimum without limits if it keeps all of them: no solver has to be set up for it."""
-        chosen, v = np.flatnonzero(pattern), self.condensed.n_violations
-        moves = np.zeros(len(pattern))
-        moves[chosen] = d = -np.linalg.solve(
-            self.condensed.H[chosen[:, None], chosen], instance.f_moves[chosen]
-        )
-        rows = self.condensed.bounded_rows[:, chosen] @ d
-        inside = (rows >= instance.lower[v:]).all() and (rows <= instance.upper[v:]).all()
-        if not inside or (self.admissible.sized and (np.abs(d) < self.admissible.min_size[chosen]).any()):
-            return None
-        return moves
-
     def _without_rounding(self, instance: Instance, moves: Array) -> Array:
         """The moves with inputs exactly within their limits, and changes too small to count exactly zero."""
         limits, u = self.condensed.problem.limits, instance.u_previous
@@ -175,12 +195,11 @@ class PatternSolver:
             u = u + change
         return changes.ravel()
 
-    def _solver(self, pattern: BoolArray) -> tuple[Restriction, DaqpSolver]:
+    def _prepared(self, pattern: BoolArray) -> Prepared:
         key = pattern.tobytes()
         entry = self._kept.get(key)
         if entry is None:
-            restriction = self.condensed.restricted(pattern)
-            entry = self._kept[key] = restriction, DaqpSolver(restriction.program)
+            entry = self._kept[key] = Prepared(self.condensed, pattern.copy())
             if len(self._kept) > MOST_KEPT:
                 self._kept.popitem(last=False)
         else:

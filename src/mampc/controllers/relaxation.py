@@ -19,6 +19,10 @@ class Relaxation:
         pins = np.eye(n, program.n_variables, k=condensed.n_violations)
         self._solver = DaqpSolver(QuadraticProgram(program.H, np.vstack([program.A, pins]), program.n_simple))
 
+    def begin(self) -> None:
+        """Begin a sample, whose answers are not to depend on those of the last one."""
+        self._solver.start()
+
     def multipliers(self, instance: Instance, free: BoolArray) -> Array | None:
         """Those of the limits, shape (n_bounds,), with the moves `free`, shape (n_moves,); None without an answer."""
         width = np.where(free, UNBOUNDED, 0.0)
