@@ -30,7 +30,8 @@ from mampc.names import Names
 from mampc.offset import largest_offset
 from mampc.patterns import MoveRules
 from mampc.problem import Limits, TrackingProblem
-from mampc.regulator import Regulator, RegulatorState
+from mampc.regulator import Regulator
+from mampc.regulator_state import RegulatorState
 from mampc.signals import prbs, steps
 from mampc.simulation import Run, simulate
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -13,26 +12,11 @@ from mampc.arrays import LARGEST, Array, as_shaped, as_vector, as_whole, is_usab
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.errors import MampcError
-from mampc.estimation import Estimate, KalmanFilter
+from mampc.estimation import KalmanFilter
 from mampc.lti import StateSpace
 from mampc.problem import Limits
-from mampc.sensors import SensorChecks, SensorState
-
-FORMAT = "mampc-regulator-state-1"
-
-
-@dataclass(frozen=True, eq=False)
-class RegulatorState:
-    """What a regulator remembers between samples; plain numbers, which JSON carries exactly."""
-
-    controller: ControllerState
-    estimate: Estimate
-    measured_disturbance: Array  # shape (d,), as last told
-    sensors: SensorState
-
-    def to_json(self) -> str:
-        """The state as JSON text; `Regulator.state_from_json` gives the same numbers back, to the last bit."""
-        return json.dumps({"format": FORMAT, **asdict(self)}, default=np.ndarray.tolist)
+from mampc.regulator_state import RegulatorState
+from mampc.sensors import SensorChecks
 
 
 class Regulator:
@@ -97,35 +81,14 @@ class Regulator:
 
     def state_from_json(self, text: str) -> RegulatorState:
         """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
-        try:
-            content = json.loads(text)
-            if content.pop("format") != FORMAT:
-                raise MampcError(f"state: expected the format {FORMAT!r}")
-            numbers = {part: _numbers(values) for part, values in content.items()}
-            state = RegulatorState(
-                ControllerState(**numbers["controller"]),
-                Estimate(**numbers["estimate"]),
-                numbers["measured_disturbance"],
-                SensorState(**numbers["sensors"]),
-            )
-            shape = (self.controller.problem.control_horizon, *state.controller.inputs.shape[1:])
-            started = replace(
-                self.initial_state().controller,
-                guess=None if state.controller.guess is None else np.zeros(shape),
-                active=None
-                if state.controller.active is None
-                else np.zeros(self.controller.condensed.program.n_bounds),
-            )
-            received = _shapes(state)
-            expected = _shapes(replace(self.initial_state(), controller=started))
-        except MampcError:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            raise MampcError(
-                f"state: expected what RegulatorState.to_json writes, received: {error!r}"
-            ) from None
-        if received != expected:
-            raise MampcError(f"state: expected one of this regulator ({expected}), received {received}")
+        state, problem = RegulatorState.from_json(text), self.controller.problem
+        expected = self.initial_state().shapes() | {
+            "controller.guess": (problem.control_horizon, problem.model.n_inputs),
+            "controller.active": (self.controller.condensed.program.n_bounds,),
+        }
+        for place, shape in state.shapes().items():
+            if shape != expected[place] and shape is not None:
+                raise MampcError(f"state: expected {place} of shape {expected[place]}, received {shape}")
         return state
 
     def step(
@@ -216,22 +179,6 @@ def _unmasked(values: Any) -> Any:
 def _where_usable(told: Array, otherwise: Array) -> Array:
     """The numbers told, and the others where they are not usable."""
     return np.where((told > -LARGEST) & (told < LARGEST), told, otherwise)
-
-
-def _numbers(value: Any) -> Any:
-    """Lists of numbers as arrays; dictionaries entry by entry; numbers and None as they are."""
-    if isinstance(value, dict):
-        return {name: _numbers(entry) for name, entry in value.items()}
-    return np.array(value, dtype=np.float64) if isinstance(value, list) else value
-
-
-def _shapes(state: RegulatorState) -> dict[str, Any]:
-    """The shape of every array of a state, by its place."""
-    return {
-        f"{part}.{name}": np.shape(value)
-        for part, content in asdict(state).items()
-        for name, value in (content.items() if isinstance(content, dict) else [("value", content)])
-    }
 
 
 def _sizes(model: StateSpace) -> str:

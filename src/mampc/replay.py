@@ -15,7 +15,8 @@ from mampc.arrays import Array, as_number
 from mampc.csv_table import CSVTable
 from mampc.errors import MampcError
 from mampc.names import Names
-from mampc.regulator import Regulator, RegulatorState
+from mampc.regulator import Regulator
+from mampc.regulator_state import RegulatorState
 from mampc.simulation import Run
 
 SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit

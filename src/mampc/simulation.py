@@ -20,7 +20,8 @@ from mampc.lti import StateSpace
 from mampc.metrics import Metrics
 from mampc.names import Names
 from mampc.plants import Plant, advance
-from mampc.regulator import Regulator, RegulatorState
+from mampc.regulator import Regulator
+from mampc.regulator_state import RegulatorState
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -20,7 +20,8 @@ from mampc.lti import StateSpace
 from mampc.patterns import MoveRules
 from mampc.plants import Plant
 from mampc.problem import Limits, TrackingProblem
-from mampc.regulator import Regulator, RegulatorState
+from mampc.regulator import Regulator
+from mampc.regulator_state import RegulatorState
 from mampc.sensors import SensorChecks
 from mampc.signals import prbs, steps
 from mampc.simulation import Run, at_rest, simulate
