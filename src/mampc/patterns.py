@@ -341,7 +341,7 @@ class Exchanges:
 
     def swaps(self) -> BoolArray:
         """Whether each held move (row) may be exchanged for each other move, shape (k, n_moves)."""
-        allowed = np.tile(self._open & ~self.pattern, (len(self.held), 1))
+        allowed = np.repeat((self._open & ~self.pattern)[None], len(self.held), axis=0)
         if self._of.simple:
             return allowed
         at = self._at_without()
@@ -370,10 +370,7 @@ class Exchanges:
 
     def swapped_price(self) -> Array:
         """What exchanging each held move for each other costs, shape (k, n_moves)."""
-        if self._of.simultaneous:
-            added = np.where(self._at_without() > 0, 0.0, self._price)
-        else:
-            added = np.tile(self._price, (len(self.held), 1))
+        added = np.where(self._at_without() > 0, 0.0, self._price) if self._of.simultaneous else self._price
         return added - self.dropped_price()[:, None]
 
 

@@ -120,15 +120,16 @@ class ExactSearch:
     def _search_tree(self, instance: Instance, past: Past) -> Plan:
         """A good plan by local search, then the tree of everything that may beat it."""
         best, deadline = Incumbent(), self._deadline()
-        best.offer(self._solver.solve(instance, np.zeros(self.condensed.n_moves, dtype=bool)))
-        self._local.offer(self._solver, instance, past, best, deadline)
         tie = TIE * max(1e-6, instance.constant)
         sample = Sample(self, instance, best, deadline, tie)
-        plain = None
+        priced = [(instance.f_moves, instance.constant)]
         if instance.margins.min(initial=np.inf) < 0:  # plain MPC runs into limits
             plain = sample.relaxed(np.ones(self.condensed.n_moves, dtype=bool))
-        limits = [limits for limits in (plain, sample.priced(best.multipliers)) if limits is not None]
-        priced = [(instance.f_moves, instance.constant), *limits]
+            priced += [plain] if plain is not None else []
+        best.offer(self._solver.solve(instance, np.zeros(self.condensed.n_moves, dtype=bool)))
+        self._local.offer(self._solver, instance, priced[-1][0], past, best, deadline)
+        if (limits := sample.priced(best.multipliers)) is not None:
+            priced.append(limits)
         open_bound = self._tree.search(priced, past, best.objective - tie, deadline, sample)
         if open_bound < best.objective - tie:
             return self._plan(instance, best, open_bound, Status.TIME_LIMIT)

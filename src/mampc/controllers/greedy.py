@@ -31,5 +31,5 @@ class GreedySearch(HeuristicSearch):
     def _propose(
         self, instance: Instance, past: Past, guess: Array | None, best: Incumbent
     ) -> tuple[int, Array | None]:
-        self._local.offer(self._solver, instance, past, best)
+        self._local.offer(self._solver, instance, self._priced_limits(instance), past, best)
         return best.solved, None

@@ -81,10 +81,19 @@ class LocalSearch:
         return exchanges.pattern
 
     def offer(
-        self, solver: PatternSolver, instance: Instance, past: Past, best: Incumbent, deadline: float = np.inf
+        self,
+        solver: PatternSolver,
+        instance: Instance,
+        f: Array,
+        past: Past,
+        best: Incumbent,
+        deadline: float = np.inf,
     ) -> None:
-        """Offer the plans of a local search to the incumbent; multipliers of one round price limits in the next."""
-        f, least_gain = instance.f_moves, LEAST_GAIN * instance.constant
+        """Offer the plans of a local search to the incumbent; multipliers of one round price limits in the next.
+
+        The first round takes the linear term f, shape (n_moves,): best with limits priced in that plain MPC runs into.
+        """
+        least_gain = LEAST_GAIN * instance.constant
         pattern = self.forward(f, past)
         for number in range(ROUNDS):
             last, pattern = pattern, self.exchange(f, past, pattern, least_gain)
@@ -97,8 +106,8 @@ class LocalSearch:
 
     def _gain(self, r: Array, q: Array) -> Array:
         """What a move gains, given its gradient and curvature, when it has at least its least size."""
-        size = np.abs(r) / q
-        if self.admissible.sized:
-            size = np.maximum(size, self.admissible.min_size)
-            return np.abs(r) * size - 0.5 * q * size * size
-        return 0.5 * size * np.abs(r)
+        if not self.admissible.sized:
+            gain: Array = 0.5 * r * r / q
+            return gain
+        size = np.maximum(np.abs(r) / q, self.admissible.min_size)
+        return np.asarray(np.abs(r) * size - 0.5 * q * size * size)

@@ -190,9 +190,9 @@ class PatternSolver:
         limits, u = self.condensed.problem.limits, instance.u_previous
         changes = moves.reshape(-1, len(u)).copy()
         wanted = np.clip(u + changes.cumsum(axis=0), limits.u_min, limits.u_max)
-        for change, level in zip(changes, wanted, strict=True):
-            change[:] = np.where(np.abs(level - u) > SAME, level - u, 0.0)
-            u = u + change
+        for j in np.flatnonzero(changes.any(axis=1)):
+            changes[j] = np.where(np.abs(wanted[j] - u) > SAME, wanted[j] - u, 0.0)
+            u = u + changes[j]
         return changes.ravel()
 
     def _prepared(self, pattern: BoolArray) -> Prepared:

@@ -74,7 +74,8 @@ class PenaltyDecompositionSearch(HeuristicSearch):
                 settings.tolerance, settings.max_iterations,
             )  # fmt: skip
             rounds += inner.rounds
-            if inner.status is not QPStatus.OPTIMAL:
+            # Not settled by its last round, the alternation goes on with the next mu.
+            if inner.status not in (QPStatus.OPTIMAL, QPStatus.ITERATION_LIMIT):
                 best.failure = inner.status
                 return rounds, None
             v = inner.v
