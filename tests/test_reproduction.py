@@ -7,7 +7,7 @@ import pytest
 from mampc.report import reproduction
 from mampc.report.page import Page
 from mampc.study import load_study, parse_study, template
-from mampc.study.running import prepare, run_controller
+from mampc.study.running import prepare, regulator_of, run_controller
 from mampc.sweep import Point, holding, sensitivity, varied
 
 
@@ -59,7 +59,9 @@ def test_a_sensitivity_point_equals_the_runs_it_stands_for(written):
     prepared, scenario = prepare(study), study.scenarios[-1]
     plain, sparse = study.controllers[0], study.controllers[2]
     base, other = (
-        run_controller(study, prepared, scenario, table).metrics(threshold=0.1)
+        run_controller(study, prepared, scenario, regulator_of(study, prepared.model, table)).metrics(
+            threshold=0.1
+        )
         for table in (plain, varied(study, scenario, sparse, "penalty", 1.0)[2])
     )
     point = cases[0].points[0]

@@ -8,7 +8,8 @@ import pytest
 from rich.console import Console
 
 import mampc
-from mampc.report.output import published_together, require_writable, write_study
+from mampc.report.folder import ResultFolder
+from mampc.report.output import run_and_write
 from mampc.report.summary import summarise
 from mampc.report.tables import comparison_tables
 from mampc.study import builtin_studies, load_study, parse_study, run_study, template
@@ -140,8 +141,8 @@ def test_the_summary_holds_what_is_promised(result):
             assert entry["moves"] == sum(entry["moves_per_input"])
 
 
-def test_the_files_of_a_run_can_be_read_back(result, tmp_path):
-    summary, missing = write_study(result, tmp_path / "out")
+def test_the_files_of_a_run_can_be_read_back(tmp_path):
+    result, summary, missing = run_and_write(parse_study(SHORT), tmp_path / "out")
     assert missing is None
     assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
     model = mampc.StateSpace.load(tmp_path / "out" / "model.json")
@@ -153,51 +154,58 @@ def test_the_files_of_a_run_can_be_read_back(result, tmp_path):
             assert (tmp_path / "out" / "figures" / f"{name}.{kind}").stat().st_size > 1000
 
 
-def test_results_appear_whole_or_not_at_all(tmp_path):
-    target = tmp_path / "out"
-    with pytest.raises(RuntimeError), published_together(target) as folder:
-        (folder / "half.csv").write_text("1")
+def test_a_file_of_a_result_folder_appears_whole_or_not_at_all(tmp_path):
+    folder = ResultFolder(tmp_path / "out", last="summary.json")
+    with pytest.raises(RuntimeError), folder.writing("a.csv") as unfinished:
+        unfinished.write_text("half")
         raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
+    assert not (tmp_path / "out" / "a.csv").exists()
+    with folder.writing("a.csv") as unfinished:
+        unfinished.write_text("whole")
+    assert (tmp_path / "out" / "a.csv").read_text() == "whole"
 
+
+def test_a_new_run_clears_the_last_one_away_and_leaves_files_of_others(tmp_path):
+    target = tmp_path / "out"
+    for names in (("a.csv", "figures/b.png", "summary.json"), ("c.csv", "summary.json")):
+        folder = ResultFolder(target, last="summary.json")
+        (target / "notes.txt").write_text("mine")
+        folder.clear()
+        for name in names:
+            with folder.writing(name) as unfinished:
+                unfinished.write_text(name)
+    left = {path.relative_to(target).as_posix() for path in target.rglob("*") if path.is_file()}
+    assert left == {"c.csv", "summary.json", "notes.txt", ".mampc-files"}
+
+
+def test_a_list_of_files_that_leads_out_of_its_folder_is_not_believed(tmp_path):
+    (tmp_path / "mine.csv").write_text("mine")
+    folder = ResultFolder(tmp_path / "out", last="summary.json")
+    (tmp_path / "out" / ".mampc-files").write_text("../mine.csv\n")
+    folder.clear()
+    assert (tmp_path / "mine.csv").exists()
+
+
+def test_what_a_killed_run_left_half_written_is_cleared_away(tmp_path):
+    target = tmp_path / "out"
     target.mkdir()
-    (target / "notes.txt").write_text("mine")
-    (target / "summary.json").write_text("old")
-    with pytest.raises(RuntimeError), published_together(target) as folder:
-        (folder / "summary.json").write_text("new")
-        raise RuntimeError
-    assert (target / "summary.json").read_text() == "old"
-
-    with published_together(target) as folder:
-        (folder / "summary.json").write_text("new")
-    assert (target / "summary.json").read_text() == "new"
-    assert (target / "notes.txt").read_text() == "mine"
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    (target / ".a.csv.partial-999999999").write_text("half")
+    ResultFolder(target, last="summary.json")
+    assert list(target.iterdir()) == []
 
 
-def test_files_of_the_last_run_that_are_not_made_again_go_away(tmp_path):
-    target = tmp_path / "out"
-    for names in (("a.csv", "b.csv", "summary.json"), ("b.csv", "summary.json")):
-        with published_together(target) as folder:
-            for name in names:
-                (folder / name).write_text(name)
-    assert sorted(path.name for path in target.glob("*.*") if path.name[0] != ".") == [
-        "b.csv",
-        "summary.json",
-    ]
-
-
-def test_what_a_killed_run_left_is_cleared_away(tmp_path):
-    target = tmp_path / "out"
-    (tmp_path / ".out.partial-999999999-left").mkdir()
-    require_writable(target)
-    assert list(tmp_path.iterdir()) == []
+def test_a_study_that_does_not_fit_leaves_the_last_results_alone(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.json").write_text("old")
+    wrong = SHORT.replace("control_horizon = 5", "control_horizon = 15")
+    with pytest.raises(mampc.StudyError):
+        run_and_write(parse_study(wrong), tmp_path / "out")
+    assert (tmp_path / "out" / "summary.json").read_text() == "old"
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
     text = SHORT.replace('name = "MPC"', r"name = 'a [/b] $\foo{$'")
-    outcome = run_study(parse_study(text))
-    summary, missing = write_study(outcome, tmp_path / "out")
+    outcome, summary, missing = run_and_write(parse_study(text), tmp_path / "out")
     assert missing is None
     console = Console(width=200, file=io.StringIO())
     for table in comparison_tables(outcome.study, summary):
@@ -208,8 +216,7 @@ def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
 def test_trajectories_of_names_that_share_words_stay_apart(tmp_path):
     text = SHORT.replace('name = "noise-free"', 'name = "a"').replace('name = "noisy"', 'name = "a-b"')
     text = text.replace('name = "MPC"', 'name = "c"').replace('name = "MAMPC ns=1"', 'name = "b-c"')
-    outcome = run_study(parse_study(text))
-    write_study(outcome, tmp_path / "out")
+    outcome, *_ = run_and_write(parse_study(text), tmp_path / "out")
     runs = sum(len(runs) for runs in outcome.runs.values())
     assert len(list((tmp_path / "out").glob("a*.csv"))) == runs
 

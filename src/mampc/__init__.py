@@ -32,6 +32,8 @@ from mampc.patterns import MoveRules
 from mampc.problem import Limits, TrackingProblem
 from mampc.regulator import Regulator
 from mampc.regulator_state import RegulatorState
+from mampc.replay import Difference, Recording, replay
+from mampc.sensors import Fault, SensorChecks
 from mampc.signals import prbs, steps
 from mampc.simulation import Run, simulate
 
@@ -46,7 +48,9 @@ __all__ = [
     "Alternating",
     "ControllerState",
     "Decision",
+    "Difference",
     "Exact",
+    "Fault",
     "Greedy",
     "HardThresholding",
     "IOData",
@@ -58,11 +62,13 @@ __all__ = [
     "MoveRules",
     "Names",
     "PenaltyDecomposition",
+    "Recording",
     "Regulator",
     "RegulatorState",
     "Remark",
     "ReweightedL1",
     "Run",
+    "SensorChecks",
     "StateSpace",
     "Status",
     "StudyError",
@@ -74,6 +80,7 @@ __all__ = [
     "n4sid",
     "plants",
     "prbs",
+    "replay",
     "simulate",
     "steps",
     "validate",

@@ -1,0 +1,296 @@
+"""Limits told at run time, actuators that do as they like, manual mode, emergency moves."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import mampc
+from builders import identified_tank, predicted, random_model, tank_problem, violation_scale
+from mampc import Remark, Status
+
+METHODS = ["mpc", *mampc.METHODS]
+UPPER = mampc.Limits(u_min=0.0, u_max=100.0)
+
+
+def controller_of(method, problem, rules=None, **settings):
+    if method == "mpc":
+        return mampc.MPC(problem)
+    if method == "alternating":
+        settings = {"warm_up": 0, **settings}
+    return mampc.MAMPC(problem, rules or mampc.MoveRules(price=0.1, max_moves=6), method=method, **settings)
+
+
+# Limits of one sample
+
+
+def random_limits(rng, problem, low=0.05):
+    """Limits of one sample, varying over the horizon, that leave room around the operating point."""
+    model, n_c, n_p = problem.model, problem.control_horizon, problem.prediction_horizon
+    l, m = model.n_outputs, model.n_inputs
+    return mampc.Limits(
+        u_min=model.u_op - rng.uniform(low, 0.5, (n_c, m)),
+        u_max=model.u_op + rng.uniform(low, 0.5, (n_c, m)),
+        du_max=rng.uniform(0.1, 0.4, (n_c, m)),
+        y_min=model.y_op - rng.uniform(0.0, 1.0, (n_p, l)),
+        y_max=model.y_op + rng.uniform(0.0, 1.0, (n_p, l)),
+    )
+
+
+def random_problem(seed):
+    model = random_model(seed, n=3, m=2, l=2)
+    limits = mampc.Limits(
+        u_min=model.u_op - 1, u_max=model.u_op + 1, du_max=0.8, y_min=model.y_op - 5, y_max=model.y_op + 5
+    )
+    return mampc.TrackingProblem(model, prediction_horizon=6, control_horizon=3, limits=limits)
+
+
+def best_by_cvxpy(problem, limits, x, u_previous, reference, pattern):
+    """The least cost within limits that vary over the horizon, moves off the pattern being zero."""
+    model, n_p, n_c = problem.model, problem.prediction_horizon, problem.control_horizon
+    u, e = cp.Variable((n_c, model.n_inputs)), cp.Variable(model.n_outputs, nonneg=True)
+    outputs, state = [], x
+    for i in range(n_p + 1):
+        now = u[min(i, n_c - 1)] - model.u_op
+        outputs.append(model.y_op + model.C @ state + model.D @ now)
+        state = model.A @ state + model.B @ now
+    changes = u - cp.vstack([u_previous[None], u[:-1]])
+    cost = sum(cp.sum_squares(reference - y) for y in outputs) + 0.1 * cp.sum_squares(changes)
+    scaled = cp.multiply(violation_scale(problem), e)
+    cost += problem.output_limit_weight * (cp.sum(scaled) + cp.sum_squares(scaled) / 2)
+    constraints = [u >= limits.u_min, u <= limits.u_max, cp.abs(changes) <= limits.du_max]
+    constraints += [outputs[i + 1] <= limits.y_max[i] + e for i in range(n_p)]
+    constraints += [outputs[i + 1] >= limits.y_min[i] - e for i in range(n_p)]
+    constraints += [changes[~pattern] == 0] if (~pattern).any() else []
+    problem_ = cp.Problem(cp.Minimize(cost), constraints)
+    problem_.solve(solver=cp.CLARABEL)
+    return problem_.value if problem_.status == "optimal" else np.inf
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_limits_that_vary_over_the_horizon_are_those_of_the_optimum(seed):
+    """Every pattern with at most two moves by an independent solver against the exact search; and plain MPC."""
+    rng, problem = np.random.default_rng(seed), random_problem(seed)
+    model, limits = problem.model, random_limits(rng, problem)
+    x, reference = 0.5 * rng.standard_normal(3), model.y_op + rng.standard_normal(2)
+    exact = controller_of("exact", problem, mampc.MoveRules(max_moves=2, price=0.02))
+    decision = exact.step(exact.initial_state(), x, reference, limits=limits)
+    mpc = mampc.MPC(problem)
+    free = mpc.step(mpc.initial_state(), x, reference, limits=limits)
+    all_free = np.ones((3, 2), dtype=bool)
+    best = best_by_cvxpy(problem, limits, x, model.u_op, reference, all_free)
+    assert free.objective == pytest.approx(best, rel=1e-6)
+    values = []
+    for chosen in [(), *((i,) for i in range(6)), *((i, j) for i in range(6) for j in range(i))]:
+        pattern = np.zeros(6, dtype=bool)
+        pattern[list(chosen)] = True
+        pattern = pattern.reshape(3, 2)
+        cost = best_by_cvxpy(problem, limits, x, model.u_op, reference, pattern)
+        values.append(cost + 0.02 * pattern.sum())
+    assert decision.status is Status.OPTIMAL
+    assert decision.objective == pytest.approx(min(values), rel=1e-6)
+    for plan in (decision.plan, free.plan):
+        assert (plan >= limits.u_min - 1e-9).all()
+        assert (plan <= limits.u_max + 1e-9).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_method_keeps_limits_told_at_run_time(method, seed):
+    rng, problem = np.random.default_rng(seed), random_problem(seed)
+    controller, model = controller_of(method, problem), problem.model
+    state, x, u = controller.initial_state(), np.zeros(3), model.u_op
+    for _ in range(25):
+        limits = random_limits(rng, problem)
+        decision = controller.step(state, x, model.y_op + 2 * rng.standard_normal(2), limits=limits)
+        assert (decision.u >= limits.u_min[0]).all()
+        assert (decision.u <= limits.u_max[0]).all()
+        if Remark.BACK_INSIDE not in decision.remarks:
+            assert (np.abs(decision.u - u) <= limits.du_max[0] + 1e-9).all()
+        state, u = decision.state, decision.u
+        x = model.A @ x + model.B @ (u - model.u_op)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_limits_that_contradict_one_another_hold_the_inputs_and_spoil_nothing(method):
+    problem = tank_problem(identified_tank())
+    controller = controller_of(method, problem)
+    state, x, r = controller.initial_state(), np.array([0.3, -0.2, 0.1, 0.0]), problem.model.y_op + 2.0
+    before = controller.step(state, x, r)
+    crossed = controller.step(state, x, r, limits=mampc.Limits(u_min=[60.0, 0.0], u_max=[40.0, 100.0]))
+    assert crossed.status is Status.HELD_INFEASIBLE
+    np.testing.assert_array_equal(crossed.u, state.inputs[-1])
+    after = controller.step(state, x, r)
+    np.testing.assert_array_equal(after.plan, before.plan)
+    assert after.objective == before.objective
+
+
+def test_limits_that_are_no_numbers_stay_as_the_problem_has_them():
+    controller = mampc.MPC(tank_problem())
+    state, r = controller.initial_state(), controller.problem.model.y_op + 60.0
+    usual = controller.step(state, np.zeros(4), r)
+    told = controller.step(state, np.zeros(4), r, limits=mampc.Limits(u_max=[np.nan, np.inf], u_min=np.nan))
+    np.testing.assert_allclose(told.plan, usual.plan, atol=1e-9)
+
+
+def test_run_time_limits_of_inputs_never_widen_those_of_the_problem_and_those_of_outputs_may():
+    model = identified_tank()
+    limits = mampc.Limits(u_min=0.0, u_max=60.0, y_max=model.y_op + 1.0)
+    controller = mampc.MPC(tank_problem(model, limits=limits))
+    state, r = controller.initial_state(), model.y_op + 20.0
+    wide = mampc.Limits(u_max=90.0, y_max=model.y_op + 50.0)
+    assert controller.step(state, np.zeros(4), r, limits=wide).u.max() == 60.0
+    narrow = controller.step(state, np.zeros(4), r)
+    y = predicted(model, np.zeros(4), narrow.plan, 11)
+    assert (y <= model.y_op + 1.0 + 1e-6).all()
+    y = predicted(model, np.zeros(4), controller.step(state, np.zeros(4), r, limits=wide).plan, 11)
+    assert (y > model.y_op + 1.1).any()
+
+
+def test_a_limit_that_the_problem_does_not_have_is_refused_at_run_time():
+    controller = mampc.MPC(tank_problem())
+    for limits in (mampc.Limits(y_max=30.0), mampc.Limits(du_max=1.0), mampc.Limits(u_max=np.zeros((3, 3)))):
+        with pytest.raises(mampc.MampcError, match=r"limits: expected.*received"):
+            controller.step(
+                controller.initial_state(), np.zeros(4), controller.problem.model.y_op, limits=limits
+            )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_plant_outside_its_output_limits_is_brought_back_and_the_violation_is_told(method):
+    model = identified_tank()
+    high = model.y_op + np.array([-2.0, 5.0])
+    problem = tank_problem(
+        model, prediction_horizon=20, limits=mampc.Limits(u_min=0.0, u_max=100.0, y_max=high)
+    )
+    controller = controller_of(method, problem)
+    state, x, told = controller.initial_state(), np.zeros(4), []
+    for _ in range(60):
+        decision = controller.step(state, x, model.y_op + np.array([-3.0, 0.0]))
+        assert not decision.held
+        told.append(decision.violations)
+        y = predicted(model, x, decision.plan, 21)[1:]
+        np.testing.assert_allclose(told[-1], np.maximum(0, (y - high).max(axis=0)), atol=1e-6)
+        state = decision.state
+        x = model.A @ x + model.B @ (decision.u - model.u_op)
+    assert told[0][0] > 0.5
+    np.testing.assert_allclose(told[-1], 0.0, atol=1e-6)
+
+
+# Actuators and manual mode
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_input_in_manual_stays_where_it_is_and_the_other_does_the_work(method):
+    problem = tank_problem(identified_tank(), prediction_horizon=20)
+    controller = controller_of(method, problem, mampc.MoveRules(max_moves=4))
+    decision = controller.step(
+        controller.initial_state([40.0, 55.0]), np.zeros(4), problem.model.y_op + 3.0, manual=[True, False]
+    )
+    np.testing.assert_array_equal(decision.plan[:, 0], 40.0)
+    assert decision.moves[:, 1].any()
+    everything = controller.step(
+        controller.initial_state([40.0, 55.0]), np.zeros(4), problem.model.y_op + 3.0, manual=[True, True]
+    )
+    np.testing.assert_array_equal(everything.plan, np.tile([40.0, 55.0], (5, 1)))
+
+
+@pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=0.5, max_moves=3, sparsity_horizon=3)])
+def test_back_from_manual_there_is_no_bump(rules):
+    """An operator takes the plant elsewhere and leaves it at rest there, at the reference."""
+    problem = tank_problem(identified_tank(), prediction_horizon=20)
+    controller, model = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules), problem.model
+    regulator = mampc.Regulator(controller)
+    state, x, u = regulator.initial_state(), np.zeros(4), model.u_op
+    by_hand = model.u_op + np.array([4.0, -3.0])
+    goal = model.y_op + model.dc_gain() @ (by_hand - model.u_op)
+    for k in range(220):
+        decision = regulator.step(
+            state, model.y_op + model.C @ x, goal, u_applied=u, manual=[k < 200, k < 200]
+        )
+        state = decision.state
+        u = by_hand if k < 200 else decision.u
+        x = model.A @ x + model.B @ (u - model.u_op)
+        if k >= 200:
+            np.testing.assert_allclose(u, by_hand, atol=1e-3)
+
+
+def test_moves_made_by_hand_count_in_the_window():
+    problem = tank_problem(identified_tank())
+    rules = mampc.MoveRules(max_moves=2, sparsity_horizon=4)
+    regulator = mampc.Regulator(mampc.MAMPC(problem, rules))
+    state, y = regulator.initial_state(), problem.model.y_op
+    for u in ([51.0, 50.0], [51.0, 52.0]):
+        state = regulator.step(state, y, y, u_applied=u, manual=[True, True]).state
+    decision = regulator.step(state, y, y + 5.0, u_applied=[51.0, 52.0])
+    assert not decision.moves.any()
+
+
+@pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=0.2)])
+@pytest.mark.parametrize("fault", ["saturated", "stuck", "late"])
+def test_what_the_actuators_really_did_is_told_and_leaves_no_offset(rules, fault):
+    problem = tank_problem(identified_tank(), prediction_horizon=20)
+    model = problem.model
+    controller = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules)
+    regulator = mampc.Regulator(controller)
+    state, x, applied, wanted = regulator.initial_state(), np.zeros(4), model.u_op, model.u_op
+    reference, y = model.y_op + np.array([1.0, -1.0]), model.y_op
+    for k in range(300):
+        y = model.y_op + model.C @ x
+        decision = regulator.step(state, y, reference, u_applied=applied)
+        state, last, wanted = decision.state, wanted, decision.u
+        applied = wanted
+        if fault == "saturated" and k < 100:
+            applied = np.minimum(wanted, model.u_op + 0.5)
+        if fault == "stuck" and 5 <= k < 100:
+            applied = np.array([model.u_op[0], wanted[1]])
+        if fault == "late":
+            applied = last
+        x = model.A @ x + model.B @ (applied - model.u_op)
+    error = np.abs(y - reference)
+    assert (error < (1e-3 if rules is None else 0.5)).all()
+
+
+# Emergency moves
+
+
+def urgent_case(**options):
+    """A spent budget, and a plant that leaves its limits unless something moves."""
+    model = identified_tank()
+    limits = mampc.Limits(u_min=0.0, u_max=100.0, y_max=model.y_op + 1.0)
+    problem = tank_problem(model, limits=limits)
+    rules = mampc.MoveRules(max_moves=2, sparsity_horizon=5)
+    controller = mampc.MAMPC(problem, rules, **options)
+    u = model.u_op
+    past = np.array([u, u, u + [3.0, 0.0], u + [3.0, 3.0]])
+    x = model.steady_state(u + 8.0)
+    return controller, controller.initial_state(past), x, model.y_op
+
+
+@pytest.mark.parametrize("method", ["exact", "greedy"])
+def test_rules_are_suspended_where_an_output_would_leave_its_limits_by_more_than_the_margin(method):
+    kept = urgent_case(method=method)
+    ignored = urgent_case(method=method, on_limit_violation="ignore_budget", violation_margin=0.5)
+    patient = urgent_case(method=method, on_limit_violation="ignore_budget", violation_margin=50.0)
+    by_rule = kept[0].step(*kept[1:])
+    assert not by_rule.moves.any()
+    assert by_rule.violations.max() > 1.0
+    urgent = ignored[0].step(*ignored[1:])
+    assert Remark.RULES_SUSPENDED in urgent.remarks
+    assert urgent.violations.max() < by_rule.violations.max()
+    assert urgent.moves[0].any()
+    assert urgent.gap == np.inf
+    assert Remark.RULES_SUSPENDED not in patient[0].step(*patient[1:]).remarks
+
+
+def test_rules_are_not_suspended_where_that_would_not_help():
+    controller, state, x, r = urgent_case(on_limit_violation="ignore_budget")
+    stuck = controller.step(state, x, r, manual=[True, True])
+    assert Remark.RULES_SUSPENDED not in stuck.remarks
+
+
+@pytest.mark.parametrize(
+    "options", [{"on_limit_violation": "panic"}, {"violation_margin": -1.0}, {"violation_margin": [1.0] * 3}]
+)
+def test_emergency_settings_out_of_range_are_refused(options):
+    with pytest.raises(mampc.MampcError, match=r"expected.*received"):
+        urgent_case(**options)

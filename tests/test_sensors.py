@@ -1,0 +1,188 @@
+"""Bad measurements: what is believed, what is not, and how the loop goes on."""
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import identified_tank, random_model, tank_problem
+from mampc import Fault, Status
+
+TANK = mampc.plants.QuadrupleTank()
+
+
+def plant_loop(regulator, steps, spoil, *, noise=0.05, seed=0, reference=None, at_output=None):
+    """Decisions and true outputs on the model itself; `spoil(k, y)` gives what the sensors say."""
+    model = regulator.controller.problem.model
+    rng, x, u = np.random.default_rng(seed), np.zeros(model.n_states), model.u_op
+    reference = model.y_op + np.array([1.0, -0.5])[: model.n_outputs] if reference is None else reference
+    state, decisions, outputs = regulator.initial_state(), [], []
+    for k in range(steps):
+        y = model.y_op + model.C @ x + (0 if at_output is None else at_output(k))
+        outputs.append(y)
+        said = spoil(k, y + noise * rng.standard_normal(len(y)))
+        decisions.append(regulator.step(state, said, reference))
+        state, u = decisions[-1].state, decisions[-1].u
+        x = model.A @ x + model.B @ (u - model.u_op)
+    return decisions, np.array(outputs), reference
+
+
+def tank_regulator(rules=None, **options):
+    problem = tank_problem(identified_tank(), prediction_horizon=20)
+    controller = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules)
+    return mampc.Regulator(controller, **options)
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+@pytest.mark.parametrize(
+    "gone", [np.nan, np.inf, -np.inf, 1e200, np.ma.masked], ids=["nan", "inf", "-inf", "huge", "masked"]
+)
+def test_a_missing_output_is_named_and_the_other_is_still_controlled(lost, gone):
+    def spoil(k, y):
+        y = np.ma.array(y)
+        if k >= 30:
+            y[lost] = gone
+        return y
+
+    # Afterwards the other output is pushed: only its own measurement can tell.
+    load = np.zeros(2)
+    load[1 - lost] = 2.0
+    regulator = tank_regulator()
+    decisions, outputs, reference = plant_loop(
+        regulator, 160, spoil, noise=0.0, at_output=lambda k: load * (k >= 60)
+    )
+    name = regulator.controller.problem.model.names.outputs[lost]
+    assert all(d.ignored_outputs == {} for d in decisions[:30])
+    assert all(d.ignored_outputs == {name: Fault.MISSING} for d in decisions[30:])
+    assert not any(d.held for d in decisions)
+    assert np.abs(outputs[-1] - reference)[1 - lost] < 0.02
+    assert np.abs(outputs[-1] - reference)[lost] < 1.5
+
+
+def test_with_every_output_missing_the_inputs_are_held_after_max_blind_steps():
+    regulator = tank_regulator(max_blind_steps=4)
+    decisions, *_ = plant_loop(regulator, 40, lambda k, y: y * np.nan if 3 <= k < 20 else y)
+    held = [k for k, d in enumerate(decisions) if d.status is Status.HELD_BAD_MEASUREMENT]
+    assert held == list(range(7, 20))
+    assert all(len(d.ignored_outputs) == 2 for d in decisions[3:20])
+    for k in held:
+        np.testing.assert_array_equal(decisions[k].u, decisions[6].u)
+
+
+@pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=1.0)])
+def test_the_first_good_sample_moves_the_inputs_no_further_than_every_day_operation_would(rules):
+    """At rest, a blind spell and back: nothing happened meanwhile, so nothing is to be done."""
+    regulator = tank_regulator(rules)
+    model = regulator.controller.problem.model
+    decisions, *_ = plant_loop(
+        regulator, 60, lambda k, y: y * np.nan if 30 <= k < 50 else y, noise=0.0, reference=model.y_op
+    )
+    assert np.abs(np.array([d.u for d in decisions]) - model.u_op).max() < 1e-9
+
+    # A jump of the plant meanwhile: the answer is that to a jump that was seen at once.
+    jump = lambda k: np.array([1.0, 1.0]) * (k >= 40)  # noqa: E731
+    blind, *_ = plant_loop(
+        regulator, 60, lambda k, y: y * np.nan if 30 <= k < 50 else y, noise=0.0, reference=model.y_op,
+        at_output=jump,
+    )  # fmt: skip
+    seen, *_ = plant_loop(
+        regulator, 60, lambda k, y: y, noise=0.0, reference=model.y_op, at_output=lambda k: jump(k - 10)
+    )
+    np.testing.assert_allclose(blind[50].u, seen[50].u, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [20.0, -30.0, 1e5, 1e11])
+def test_a_spike_is_ignored_and_changes_nothing(size):
+    regulator = tank_regulator()
+    spiked, *_ = plant_loop(regulator, 80, lambda k, y: y + size * (k == 40) * np.array([1.0, 0.0]))
+    assert spiked[40].ignored_outputs == {"y1": Fault.JUMP}
+    assert not any(d.ignored_outputs for k, d in enumerate(spiked) if k != 40)
+    calm, *_ = plant_loop(regulator, 80, lambda k, y: y)
+    difference = max(np.abs(a.u - b.u).max() for a, b in zip(spiked, calm, strict=True))
+    noise = np.std([d.u for d in calm[60:]], axis=0).max()
+    assert difference < 4 * noise
+
+
+def test_a_jump_that_stays_is_believed_after_some_samples():
+    regulator = tank_regulator(sensors=mampc.SensorChecks(confirm=3))
+    decisions, outputs, reference = plant_loop(
+        regulator, 200, lambda k, y: y, at_output=lambda k: np.array([-15.0, 0.0]) * (k >= 40)
+    )
+    doubted = [k for k, d in enumerate(decisions) if d.ignored_outputs]
+    assert doubted == [40, 41]
+    assert abs(outputs[-1] - reference)[0] < 0.5
+
+
+def test_a_sensor_that_says_something_else_at_every_sample_is_never_believed():
+    regulator = tank_regulator()
+    swing = np.array([50.0, 0.0])
+    decisions, *_ = plant_loop(regulator, 60, lambda k, y: y + (-1) ** k * swing * (k >= 30))
+    assert all(d.ignored_outputs == {"y1": Fault.JUMP} for d in decisions[30:])
+
+
+def test_a_stuck_sensor_does_not_drive_the_plant_away():
+    """It sticks below its reference: believed, it would have the plant pushed further and further."""
+    stuck_from, seen = 40, {}
+
+    def spoil(k, y):
+        seen.setdefault("y1", y[0]) if k == stuck_from else None
+        return np.array([seen["y1"] - 0.5, y[1]]) if stuck_from <= k < 160 else y
+
+    _, trusting, _ = plant_loop(tank_regulator(sensors=mampc.SensorChecks(stuck_after=None)), 160, spoil)
+    seen.clear()
+    decisions, outputs, reference = plant_loop(tank_regulator(), 260, spoil)
+    assert np.abs(trusting[159] - reference).max() > 6.0  # and drifting on
+    found = next(k for k, d in enumerate(decisions) if d.ignored_outputs.get("y1") is Fault.STUCK)
+    assert found < 100
+    assert all(d.ignored_outputs == {"y1": Fault.STUCK} for d in decisions[found:160])
+    assert np.abs(outputs[40:] - reference).max() < 3.0
+    assert not any(d.ignored_outputs for d in decisions[162:])
+    assert np.abs(outputs[-1] - reference).max() < 0.5
+
+
+def test_values_outside_the_range_of_a_sensor_are_ignored():
+    regulator = tank_regulator(sensors=mampc.SensorChecks(y_low=0.0, y_high=[40.0, 60.0]))
+    state, y = regulator.initial_state(), regulator.controller.problem.model.y_op
+    decision = regulator.step(state, [40.5, y[1]], y)
+    assert decision.ignored_outputs == {"y1": Fault.OUT_OF_RANGE}
+    assert decision.ignored_outputs["y1"].sentence
+
+
+def test_without_finite_input_limits_every_finite_value_is_believed():
+    problem = mampc.TrackingProblem(random_model(0), prediction_horizon=8, control_horizon=3)
+    regulator = mampc.Regulator(mampc.MPC(problem))
+    decision = regulator.step(regulator.initial_state(), problem.model.y_op + 1e6, problem.model.y_op)
+    assert not decision.ignored_outputs
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_what_is_left_never_lets_the_estimate_run_away(seed):
+    """With any outputs missing for good, errors of the estimate do not grow (beyond those of the plant)."""
+    model = random_model(seed, n=4, m=2, l=3, radius=0.97)
+    kalman = mampc.KalmanFilter.offset_free(model)
+    A = np.block([[model.A, np.zeros((4, 3))], [np.zeros((3, 4)), np.eye(3)]])
+    C = np.hstack([model.C, np.eye(3)])
+    for left in ([0], [1], [0, 1], [1, 2], []):
+        believed = np.isin(np.arange(3), left)
+        gain = kalman.gain_with(believed)
+        assert (gain[:, ~believed] == 0).all()
+        assert np.abs(np.linalg.eigvals(A - gain @ C @ A)).max() <= 1 + 1e-9
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"y_low": 1.0, "y_high": 0.0},
+        {"largest_jump": 0.0},
+        {"largest_jump": [1.0]},
+        {"largest_jump": np.nan},
+        {"confirm": 0},
+        {"stuck_after": 1},
+        {"y_low": "low"},
+    ],
+    ids=str,
+)
+def test_sensor_checks_out_of_range_are_refused(options):
+    with pytest.raises(mampc.MampcError, match=r"expected.*received"):
+        tank_regulator(sensors=mampc.SensorChecks(**options))
+    with pytest.raises(mampc.MampcError, match=r"expected.*received"):
+        tank_regulator(max_blind_steps=-1)
