@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 import mampc
-from builders import cost_of, predicted, random_model
+from builders import cost_of, predicted, random_model, sample_data
 from mampc import Status
 from mampc.condensing import CondensedQP
 from mampc.controllers import ranking
+from mampc.controllers.pattern_solver import PatternSolver
+from mampc.qp import QPStatus
 from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
 
 SEEDS = range(300)
@@ -278,3 +280,42 @@ def test_without_polish_the_bound_is_that_of_exactly_sparse_plans():
     case = random_case(0)
     decision = decide(case, "alternating", warm_up=0, certify=True)
     assert decision.lower_bound == pytest.approx(best_value(0, case.rules), rel=1e-6)
+
+
+@pytest.mark.parametrize("method", [name for name in mampc.METHODS if name != "alternating"])
+@pytest.mark.parametrize("seed", range(10))
+def test_nobody_pays_for_moves_that_limits_keep_at_zero(method, seed):
+    rng, model, room = np.random.default_rng(seed), random_model(seed), np.array([1.0, 0.0])
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=6, control_horizon=3,
+        limits=mampc.Limits(u_min=model.u_op - room, u_max=model.u_op + room),
+    )  # fmt: skip
+    x, reference = rng.standard_normal(3), model.y_op + rng.standard_normal(2)
+    case = Case(problem, mampc.MoveRules(price=0.1), model.u_op[None], x, reference)
+    decision = decide(case, method)
+    assert not decision.moves[:, 1].any()
+    planned = objective_of(problem, case.rules, case.x, case.past, case.reference, decision.plan)
+    assert decision.objective == pytest.approx(planned, rel=1e-9)
+
+
+def test_a_search_over_signs_that_is_cut_short_says_so_and_offers_what_it_found():
+    model = random_model(5, m=1, l=1)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=8, control_horizon=6,
+        limits=mampc.Limits(u_max=model.u_op + 0.5, u_min=model.u_op - 0.5),
+    )  # fmt: skip
+    condensed = CondensedQP(problem, bound_every_move=True)
+    admissible = mampc.MoveRules(min_size=0.3).fitted(1, 6)
+    data = sample_data(condensed, model.u_op, x=np.ones(3), reference=model.y_op + 0.3)
+    pattern = np.ones(6, dtype=bool)
+    whole = PatternSolver(condensed, admissible).solve(data, pattern)
+    assert whole.status is QPStatus.OPTIMAL
+    statuses = set()
+    for most in range(1, 130):
+        cut = PatternSolver(condensed, admissible, most_programs=most).solve(data, pattern)
+        statuses.add(cut.status)
+        if cut.moves is not None:
+            assert cut.objective >= whole.objective - 1e-9
+            assert (np.abs(cut.moves) >= 0.3).all()
+    assert statuses == {QPStatus.TIME_LIMIT, QPStatus.OPTIMAL}
+    assert cut.objective == pytest.approx(whole.objective, rel=1e-12)

@@ -159,9 +159,8 @@ def test_a_limit_that_the_problem_does_not_have_is_refused_at_run_time():
 def test_a_plant_outside_its_output_limits_is_brought_back_and_the_violation_is_told(method):
     model = identified_tank()
     high = model.y_op + np.array([-2.0, 5.0])
-    problem = tank_problem(
-        model, prediction_horizon=20, limits=mampc.Limits(u_min=0.0, u_max=100.0, y_max=high)
-    )
+    limits = mampc.Limits(u_min=0.0, u_max=100.0, du_max=10.0, y_max=high)
+    problem = tank_problem(model, prediction_horizon=20, limits=limits)
     controller = controller_of(method, problem)
     state, x, told = controller.initial_state(), np.zeros(4), []
     for _ in range(60):
@@ -261,7 +260,7 @@ def urgent_case(**options):
     rules = mampc.MoveRules(max_moves=2, sparsity_horizon=5)
     controller = mampc.MAMPC(problem, rules, **options)
     u = model.u_op
-    past = np.array([u, u, u + [3.0, 0.0], u + [3.0, 3.0]])
+    past = np.array([u, u, u + np.array([3.0, 0.0]), u + 3.0])
     x = model.steady_state(u + 8.0)
     return controller, controller.initial_state(past), x, model.y_op
 

@@ -4,7 +4,8 @@ Every admissible pattern has a lower bound that needs no solver: its optimum wit
 taken best bound first; where the optimum keeps every limit, it is the pattern's own and the search is over;
 otherwise a quadratic program on the pattern gives its best moves and, as a by-product, multipliers of the
 limits. Any multipliers turn the limits into a change of the linear term (Lagrangian relaxation), so that all
-patterns can be ranked again with limits priced in. The search ends when no bound beats the best plan.
+patterns can be ranked again with limits priced in; so do those of programs in which more moves are free, plain
+MPC first. The search ends when no bound beats the best plan.
 
 Few patterns are listed in a table (`ranking`); more are searched as a tree (`tree`) by the same bounds.
 """
@@ -63,11 +64,11 @@ class ExactSearch:
         self.settings, self.condensed = settings, condensed
         self.admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
         self._solver = PatternSolver(condensed, self.admissible)
+        self._relaxation = Relaxation(condensed)
         self._ranking = ranking_of(condensed, self.admissible)
         if self._ranking is None:
             self._tree = PatternTree(condensed, self.admissible)
             self._local = LocalSearch(condensed, self.admissible)
-            self._relaxation = Relaxation(condensed)
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """The best moves of all admissible patterns for one sample."""
@@ -97,10 +98,17 @@ class ExactSearch:
         return np.inf if limit is None else perf_counter() + 0.95 * limit
 
     def _search_ranking(self, ranking: Ranking, bounds: Array, instance: Instance, past: Past) -> Plan:
-        """Patterns of the table best bound first, ranked again with the multipliers of each program solved."""
+        """Patterns of the table best bound first, ranked again whenever the limits are priced anew."""
         best, deadline, patterns = Incumbent(), self._deadline(), ranking.patterns[ranking.rows(past)]
-        bounds += instance.constant
         tie = TIE * max(1e-6, instance.constant)
+        sample = Sample(self, instance, best, deadline, tie)
+        bounds += instance.constant
+
+        def rank_again(limits: Priced | None) -> None:
+            if limits is not None:
+                np.maximum(bounds, ranking.bounds(limits[0], past) + limits[1], out=bounds)
+
+        rank_again(sample.of_plain())
         while True:
             index = int(bounds.argmin())
             bound = float(bounds[index])
@@ -113,9 +121,12 @@ class ExactSearch:
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(instance, best, bound, Status.TIME_LIMIT)
             bounds[index] = np.inf
-            if solved.multipliers is not None:
-                f, constant = self.condensed.relaxed_limits(instance, solved.multipliers)
-                np.maximum(bounds, ranking.bounds(f, past) + constant, out=bounds)
+            if bounds[bounds.argmin()] < best.objective - tie:
+                rank_again(sample.priced(solved.multipliers))
+                # Where this pattern does not move, its multipliers say little: price all patterns left together.
+                left = patterns[bounds < best.objective - tie]
+                if len(left):
+                    rank_again(sample.relaxed(np.asarray(left.any(axis=0))))
 
     def _search_tree(self, instance: Instance, past: Past) -> Plan:
         """A good plan by local search, then the tree of everything that may beat it."""
@@ -123,9 +134,8 @@ class ExactSearch:
         tie = TIE * max(1e-6, instance.constant)
         sample = Sample(self, instance, best, deadline, tie)
         priced = [(instance.f_moves, instance.constant)]
-        if instance.margins.min(initial=np.inf) < 0:  # plain MPC runs into limits
-            plain = sample.relaxed(np.ones(self.condensed.n_moves, dtype=bool))
-            priced += [plain] if plain is not None else []
+        if (limits := sample.of_plain()) is not None:
+            priced.append(limits)
         best.offer(self._solver.solve(instance, np.zeros(self.condensed.n_moves, dtype=bool)))
         self._local.offer(self._solver, instance, priced[-1][0], past, best, deadline)
         if (limits := sample.priced(best.multipliers)) is not None:
@@ -152,7 +162,7 @@ class ExactSearch:
 
 
 class Sample:
-    """One sample as the tree sees it: patterns are solved for, and limits priced, on demand."""
+    """One sample as the searches see it: patterns are solved for, and limits priced, on demand."""
 
     def __init__(
         self, search: ExactSearch, instance: Instance, best: Incumbent, deadline: float, tie: float
@@ -165,6 +175,12 @@ class Sample:
         solved = self._solver.solve(self._instance, pattern, self._best.objective, self._deadline)
         self._best.offer(solved)
         return self._best.objective - self._tie, self.priced(solved.multipliers)
+
+    def of_plain(self) -> Priced | None:
+        """The limits priced in that plain MPC runs into, if any."""
+        if not self._instance.margins.min(initial=np.inf) < 0:
+            return None
+        return self.priced(self._relaxation.of_plain(self._instance))
 
     def relaxed(self, free: BoolArray) -> Priced | None:
         return self.priced(self._relaxation.multipliers(self._instance, free))

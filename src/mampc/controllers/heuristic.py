@@ -18,6 +18,7 @@ from mampc.patterns import MoveRules, Past
 from mampc.qp_daqp import DaqpSolver
 
 CERTIFY_SECONDS = 1.0  # that a certificate may take, per sample
+MOST_PROGRAMS = 100  # on one pattern with least sizes, where only an exact method has to try all signs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class HeuristicSearch:
         problem = condensed.problem
         self.condensed, self.rules = condensed, rules
         self.admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
-        self._solver = PatternSolver(condensed, self.admissible)
+        self._solver = PatternSolver(condensed, self.admissible, most_programs=MOST_PROGRAMS)
         self._relaxed: DaqpSolver | None = None
         self._referee = (
             Exact(time_limit=CERTIFY_SECONDS).prepare(condensed, rules) if settings.certify else None

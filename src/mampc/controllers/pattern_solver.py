@@ -24,7 +24,7 @@ class OnPattern(NamedTuple):
 
     The moves are None where there are none below the cutoff: the objective is then a lower bound.
     Multipliers, shape (n_bounds,) and positive at upper bounds, are those without least sizes of moves.
-    The status is TIME_LIMIT where the deadline ended the search over signs: there may be better moves.
+    The status is TIME_LIMIT where the search over signs was not finished: there may be better moves.
     """
 
     moves: Array | None
@@ -91,8 +91,11 @@ class PatternSolver:
     signs, those of the optimum without least sizes first.
     """
 
-    def __init__(self, condensed: CondensedQP, admissible: Admissible) -> None:
+    def __init__(
+        self, condensed: CondensedQP, admissible: Admissible, *, most_programs: float = np.inf
+    ) -> None:
         self.condensed, self.admissible = condensed, admissible
+        self._most_programs = most_programs
         self._kept: OrderedDict[bytes, Prepared] = OrderedDict()
 
     def solve(
@@ -100,7 +103,7 @@ class PatternSolver:
     ) -> OnPattern:
         """The best moves that are zero off `pattern`, if their objective is below `cutoff`.
 
-        A search over signs stops at the deadline, of `perf_counter`.
+        A search over signs stops at the deadline, of `perf_counter`, or after `most_programs`.
         """
         base = instance.constant + self.admissible.charge(pattern)
         every_lower, every_upper = instance.lower, instance.upper
@@ -127,13 +130,15 @@ class PatternSolver:
         solver.start()
         f, H = instance.f[columns], program.H
         best, least, status = None, cutoff, QPStatus.INFEASIBLE
-        multipliers, iterations, pending = None, 0, [(every_lower[bounds], every_upper[bounds])]
+        multipliers, iterations, solved = None, 0, 0
+        pending = [(every_lower[bounds], every_upper[bounds])]
         while pending:
-            if multipliers is not None and perf_counter() > deadline:
+            if multipliers is not None and (solved >= self._most_programs or perf_counter() > deadline):
                 status = QPStatus.TIME_LIMIT
                 break
             lower, upper = pending.pop()
             solution = solver.solve(f, lower, upper)
+            solved += 1
             iterations += solution.iterations
             z = solution.z
             if z is None:

@@ -60,7 +60,10 @@ class Ranking:
 
     def rows(self, past: Past) -> slice:
         """Where the patterns stand among which the best one is, given the past."""
-        return self._rows_within[min(past.left, len(self._rows_within) - 1)]
+        rows = self._rows_within[min(past.left, len(self._rows_within) - 1)]
+        return (
+            slice(0, rows.stop) if any(past.rest) else rows
+        )  # inputs at rest may leave part of the budget unspent
 
     def bounds(self, f: Array, past: Past) -> Array:
         """A lower bound for each pattern of `rows` (infinite where the past forbids it), for the linear term f.

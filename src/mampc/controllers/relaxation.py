@@ -12,20 +12,26 @@ from mampc.qp_daqp import DaqpSolver
 
 
 class Relaxation:
-    """One warm solver for any set of free moves: a row per move pins it to zero, or not."""
+    """One warm solver for any set of free moves: a row per move pins it to zero, or not. One more for all moves."""
 
     def __init__(self, condensed: CondensedQP) -> None:
         program, n = condensed.program, condensed.n_moves
         pins = np.eye(n, program.n_variables, k=condensed.n_violations)
-        self._solver = DaqpSolver(QuadraticProgram(program.H, np.vstack([program.A, pins]), program.n_simple))
+        self._all_free = DaqpSolver(program)
+        self._pinned = DaqpSolver(QuadraticProgram(program.H, np.vstack([program.A, pins]), program.n_simple))
 
     def begin(self) -> None:
         """Begin a sample, whose answers are not to depend on those of the last one."""
-        self._solver.start()
+        self._all_free.start()
+        self._pinned.start()
+
+    def of_plain(self, instance: Instance) -> Array | None:
+        """Multipliers of the limits, shape (n_bounds,), with every move free; None without an answer."""
+        return self._all_free.solve(instance.f, instance.lower, instance.upper).multipliers
 
     def multipliers(self, instance: Instance, free: BoolArray) -> Array | None:
-        """Those of the limits, shape (n_bounds,), with the moves `free`, shape (n_moves,); None without an answer."""
+        """The same with only the moves `free`, shape (n_moves,)."""
         width = np.where(free, UNBOUNDED, 0.0)
         lower, upper = np.concatenate([instance.lower, -width]), np.concatenate([instance.upper, width])
-        multipliers = self._solver.solve(instance.f, lower, upper).multipliers
+        multipliers = self._pinned.solve(instance.f, lower, upper).multipliers
         return None if multipliers is None else multipliers[: len(instance.lower)]
