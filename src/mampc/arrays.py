@@ -17,8 +17,8 @@ LARGEST = 1e12  # in engineering units; beyond it a number is a fault, and doubl
 
 
 def is_usable(vector: Array) -> bool:
-    """Whether all entries, one at least, are numbers below `LARGEST` in size; never warns."""
-    return bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
+    """Whether all entries are numbers below `LARGEST` in size; never warns."""
+    return not vector.size or bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
 
 
 def as_shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:

@@ -131,9 +131,8 @@ class Regulator:
         u_previous = memory.inputs[-1]
         estimator, last = self.estimator, state.estimate
         estimate = estimator.predict(last, u_previous, v_last)
-        if not (
-            is_usable(estimate.x) and is_usable(estimate.output_disturbance + last.input_disturbance.sum())
-        ):
+        estimated = (estimate.x, estimate.output_disturbance, estimate.input_disturbance)
+        if not all(is_usable(part) for part in estimated):
             # It ran away without measurements: start again.
             last = estimate = estimator.initial(u_previous, y if is_usable(y) else None, v_last)
         # Measurements show v at once and u later.
