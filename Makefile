@@ -8,7 +8,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_LINK_MODE := copy
 export VIRTUAL_ENV := $(CURDIR)/.venv
 
-.PHONY: demo test lint format bench figures lock clean help
+.PHONY: demo test lint format bench methods figures lock clean help
 .DEFAULT_GOAL := help
 
 help:  ## what can be made
@@ -32,6 +32,9 @@ format: .venv/dev.stamp  ## put the code in shape
 
 bench: .venv/dev.stamp  ## speed, as ratios measured side by side
 	$(BIN)/python benchmarks/bench.py
+
+methods: .venv/dev.stamp  ## compare all methods on random instances, and renew their table in docs/methods.md
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/methods.py --markdown
 
 figures: .venv/run.stamp  ## redraw the figures of the documentation
 	$(BIN)/python docs/draw_figures.py

@@ -5,7 +5,7 @@
 Every row states a target and what was measured. Both sides of a ratio run in short interleaved blocks,
 so that whatever else the machine does hits both alike; the figure is the median over blocks of the
 ratio of the blocks' median times per call. To add a row, write a function that returns a `Row` and
-append it to `ROWS`.
+append it to `ROWS`. `measuring` says how times are taken, `sparse` has the rows of the exact method and heuristics.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from time import perf_counter
-from typing import NamedTuple
 
 import cvxpy as cp
 import daqp
@@ -26,110 +24,12 @@ from rich.console import Console
 from rich.table import Table
 
 import mampc
-from mampc.controllers.controller import Controller
+import sparse
+from measuring import LAMBDA, Asked, Row, closed_loop, interleaved, steps_of, tank_problem
 
-SAMPLES = 145
 RULES = mampc.MoveRules(max_moves=3, sparsity_horizon=3)
 PAPER = mampc.Alternating(penalty=10.0, tolerance=1e-4)
-LAMBDA = 0.1
 HEAVY = ("scipy.signal", "matplotlib", "pandas", "plotly")
-
-
-class Row(NamedTuple):
-    """One line of the table."""
-
-    name: str
-    target: str
-    measured: str
-    detail: str
-    passed: bool
-
-
-class Comparison(NamedTuple):
-    """Median seconds per call of two series, and the median over blocks of the first over the second."""
-
-    first: float
-    second: float
-    ratio: float
-
-    def __str__(self) -> str:
-        return f"{_readable(self.first)} against {_readable(self.second)}"
-
-
-Calls = Sequence[Callable]
-
-
-def interleaved(blocks: Sequence[tuple[Calls, Calls]]) -> Comparison:
-    """Time two kinds of calls block by block, in alternating order; the first block also runs untimed."""
-    medians = []
-    for number, block in enumerate([blocks[0], *blocks]):
-        times = {}
-        for key in (0, 1) if number % 2 else (1, 0):
-            times[key] = statistics.median(_timed(call) for call in block[key])
-        if number:
-            medians.append((times[0], times[1]))
-    return Comparison(
-        statistics.median(a for a, _ in medians),
-        statistics.median(b for _, b in medians),
-        statistics.median(a / b for a, b in medians),
-    )
-
-
-def _readable(seconds: float) -> str:
-    return f"{seconds * 1e6:.1f} us" if seconds < 1e-3 else f"{seconds * 1e3:.1f} ms"
-
-
-def _timed(call: Callable) -> float:
-    start = perf_counter()
-    call()
-    return perf_counter() - start
-
-
-class Asked(NamedTuple):
-    """What a controller is asked at one sample of a closed loop."""
-
-    state: mampc.ControllerState
-    x: np.ndarray
-    reference: np.ndarray
-    output_disturbance: np.ndarray
-
-
-def tank_problem() -> mampc.TrackingProblem:
-    """The paper's size and weights on a model identified from the noisy tank."""
-    u = mampc.prbs(order=8, amplitude=25.0, hold=5, mean=[50.0, 50.0])
-    data = mampc.excite(mampc.plants.QuadrupleTank(), u, dt=10.0, noise=0.1, seed=1)
-    return mampc.TrackingProblem(
-        mampc.n4sid(data, order=4, feedthrough=False).model,
-        prediction_horizon=10, control_horizon=5, move_weight=LAMBDA,
-        limits=mampc.Limits(u_min=0.0, u_max=100.0),
-    )  # fmt: skip
-
-
-def closed_loop(controller: Controller) -> list[Asked]:
-    """What the controller is asked in a noisy run of the nonlinear tank."""
-    plant, asked, step = mampc.plants.QuadrupleTank(), [], controller.step
-
-    def recording(state, x, reference, *, output_disturbance, **others):
-        asked.append(Asked(state, x, reference, output_disturbance))
-        return step(state, x, reference, output_disturbance=output_disturbance, **others)
-
-    y_op = plant.output(plant.steady_state())
-    changes = ((5, (2.0, 2.0)), (50, (-1.0, -1.5)), (100, (1.0, 0.5)))
-    reference = mampc.steps(SAMPLES, y_op, [(k, y_op + change) for k, change in changes])
-    controller.step = recording
-    try:
-        mampc.simulate(plant, mampc.Regulator(controller), reference, noise=0.1, progress=False)
-    finally:
-        del controller.step
-    return asked
-
-
-def steps_of(controller: Controller, asked: Sequence[Asked]) -> list[Callable]:
-    """One call of the controller per sample."""
-    return [
-        partial(controller.step, a.state, a.x, a.reference, output_disturbance=a.output_disturbance)
-        for a in asked
-    ]
 
 
 def mpc_against_bare_daqp(*, bounds: bool) -> Row:
@@ -268,6 +168,7 @@ ROWS: list[Callable[[], Row]] = [
     partial(mpc_against_bare_daqp, bounds=False),
     partial(mpc_against_bare_daqp, bounds=True),
     alternating_against_cvxpy,
+    *sparse.ROWS,
     import_time,
 ]
 

@@ -30,6 +30,7 @@ from mampc.instance import Instance
 from mampc.patterns import MoveRules, Past
 from mampc.qp import QPStatus
 
+TOGETHER = 3  # patterns of the table whose limits are priced together
 TIE = 1e-10  # of the cost: plans nearer than this are equally good
 
 
@@ -123,10 +124,9 @@ class ExactSearch:
             bounds[index] = np.inf
             if bounds[bounds.argmin()] < best.objective - tie:
                 rank_again(sample.priced(solved.multipliers))
-                # Where this pattern does not move, its multipliers say little: price all patterns left together.
-                left = patterns[bounds < best.objective - tie]
-                if len(left):
-                    rank_again(sample.relaxed(np.asarray(left.any(axis=0))))
+                # Where this pattern does not move, its multipliers say little: price the best ones left together.
+                few = bounds.argpartition(min(TOGETHER, len(bounds) - 1))[:TOGETHER]
+                rank_again(sample.relaxed(np.asarray(patterns[few].any(axis=0))))
 
     def _search_tree(self, instance: Instance, past: Past) -> Plan:
         """A good plan by local search, then the tree of everything that may beat it."""

@@ -1,0 +1,201 @@
+"""Every method keeps limits and rules, costs what it says, and is never better than the proven optimum."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import cost_of, random_model, same_decision, tank_problem
+from mampc import MampcError, MoveRules, Status
+from referees import charge, keeps_rules
+
+SETTINGS = {"alternating": {"polish": True, "warm_up": 0}}
+NAMES = list(mampc.METHODS)
+HEURISTICS = [name for name in NAMES if name != "exact"]
+RULES = {
+    "budget": MoveRules(max_moves=3, sparsity_horizon=3),
+    "no moves left": MoveRules(max_moves=0),
+    "price": MoveRules(price=0.5),
+    "price per input": MoveRules(price=(0.2, 1.0)),
+    "budget and price": MoveRules(max_moves=3, sparsity_horizon=2, price=0.3),
+    "simultaneous": MoveRules(max_moves=2, price=0.3, counting="simultaneous"),
+    "least size": MoveRules(max_moves=3, min_size=(0.3, 0.5)),
+    "dwell": MoveRules(dwell=3, sparsity_horizon=3),
+    "one input a step": MoveRules(max_moves_per_step=1, max_moves=3),
+    "blocks": MoveRules(blocks=(1, 2)),
+}
+
+every_method = pytest.mark.parametrize("name", NAMES)
+every_heuristic = pytest.mark.parametrize("name", HEURISTICS)
+every_rule = pytest.mark.parametrize("rules", RULES.values(), ids=RULES)
+
+
+def controller_of(problem, rules, name, **settings):
+    return mampc.MAMPC(problem, rules, method=name, **(SETTINGS.get(name, {}) | settings))
+
+
+def instance(seed, *, control_horizon=4, narrow=True, **changes):
+    """A random problem, past inputs (3, m), state and reference; narrow input limits are active."""
+    rng = np.random.default_rng(seed)
+    model = random_model(seed)
+    reach = rng.uniform(0.6, 1.2) if narrow else 1e3
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=control_horizon + 3, control_horizon=control_horizon, move_weight=0.1,
+        limits=mampc.Limits(u_min=model.u_op - reach, u_max=model.u_op + reach), **changes,
+    )  # fmt: skip
+    past = np.tile(model.u_op, (3, 1))
+    past[-1, 0] += 0.5 * (seed % 2)  # every second past holds a move
+    return problem, past, rng.standard_normal(3), model.y_op + 2 * rng.standard_normal(2)
+
+
+def decide(controller, past, x, reference):
+    return controller.step(controller.initial_state(past), x, reference)
+
+
+@every_rule
+@every_method
+def test_plans_keep_limits_and_rules_and_cost_what_they_say(name, rules):
+    for seed in range(4):
+        problem, past, x, reference = instance(seed)
+        decision = decide(controller_of(problem, rules, name), past, x, reference)
+        changes = np.diff(np.vstack([past[-1:], decision.plan]), axis=0)
+        np.testing.assert_allclose(decision.changes, changes, atol=1e-12)
+        assert (decision.moves == (np.abs(changes) > 1e-9)).all()
+        assert (decision.plan >= problem.limits.u_min).all()
+        assert (decision.plan <= problem.limits.u_max).all()
+        assert keeps_rules(rules, past, decision.moves)
+        assert (np.abs(changes) >= np.where(decision.moves, rules.min_size, 0.0) - 1e-7).all()
+        cost = cost_of(problem, x, past[-1], reference, decision.plan) + charge(rules, decision.moves)
+        assert decision.objective == pytest.approx(cost, rel=1e-8)
+
+
+@every_rule
+@every_heuristic
+def test_no_plan_is_better_than_the_proven_optimum(name, rules):
+    for seed in range(4):
+        asked = instance(seed)
+        best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
+        found = decide(controller_of(asked[0], rules, name), *asked[1:])
+        assert best.status is Status.OPTIMAL
+        assert found.status is Status.FEASIBLE
+        assert found.lower_bound == -np.inf
+        assert found.objective >= best.objective * (1 - 1e-9)
+        assert (
+            found.objective
+            <= decide(controller_of(asked[0], MoveRules(max_moves=0), "exact"), *asked[1:]).objective
+        )
+
+
+@every_method
+@pytest.mark.parametrize("narrow", [False, True])
+def test_a_budget_of_all_moves_gives_the_plan_of_plain_mpc(name, narrow):
+    problem, past, x, reference = instance(3, narrow=narrow)
+    rules = MoveRules(max_moves=3 * 2 + 2)  # all of the 4 x 2 moves
+    assert not rules.fitted(2, 4).unrestricted
+    decision = decide(controller_of(problem, rules, name), past, x, reference)
+    plain = decide(mampc.MPC(problem), past[-1:], x, reference)
+    np.testing.assert_allclose(decision.plan, plain.plan, atol=1e-7)
+    assert decision.objective == pytest.approx(plain.objective, rel=1e-9)
+
+
+@every_heuristic
+@pytest.mark.parametrize("rules", [RULES["budget"], RULES["budget and price"]])
+def test_a_certificate_holds_the_proven_optimum(name, rules):
+    for seed in range(4):
+        asked = instance(seed)
+        best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
+        certified = decide(controller_of(asked[0], rules, name, certify=True), *asked[1:])
+        plain = decide(controller_of(asked[0], rules, name), *asked[1:])
+        assert certified.objective == pytest.approx(plain.objective, rel=1e-12)
+        assert certified.lower_bound == pytest.approx(best.objective, rel=1e-8)
+        assert certified.gap == pytest.approx(certified.objective - best.objective, abs=1e-7)
+        assert (certified.status is Status.OPTIMAL) == (certified.gap <= 1e-8 * best.objective)
+
+
+def easy_instance():
+    """Inputs that act at once and for good, each on its own output: the Hessian is nearly diagonal in the moves."""
+    model = mampc.StateSpace(np.zeros((2, 2)), np.eye(2), np.eye(2), None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=3, control_horizon=3, output_weight=[1.0, 1.0], move_weight=5.0,
+        limits=mampc.Limits(u_min=-9.0, u_max=9.0),
+    )  # fmt: skip
+    return problem, np.zeros((1, 2)), np.zeros(2), np.array([3.0, 0.2])
+
+
+@every_method
+def test_an_easy_optimum_is_found(name):
+    problem, past, x, reference = easy_instance()
+    rules = MoveRules(max_moves=1)
+    best = decide(controller_of(problem, rules, "exact"), past, x, reference)
+    found = decide(controller_of(problem, rules, name), past, x, reference)
+    assert found.objective == pytest.approx(best.objective, rel=1e-9)
+    assert (found.moves == best.moves).all()
+    assert found.moves.sum() == 1
+
+
+@every_method
+def test_a_step_is_pure_and_its_state_can_be_pickled(name):
+    problem = tank_problem()
+    controller = controller_of(problem, RULES["budget"], name)
+    state, x = controller.initial_state(), np.zeros(4)
+    for k in range(4):
+        reference = problem.model.y_op + np.array([2.0, 1.0 - 0.5 * k])
+        decision = controller.step(state, x, reference)
+        again = controller.step(pickle.loads(pickle.dumps(state)), x.copy(), reference.copy())
+        assert same_decision(decision, again, atol=1e-9)
+        fresh = controller_of(problem, RULES["budget"], name).step(state, x, reference)
+        assert same_decision(decision, fresh, atol=1e-9)
+        x = problem.model.A @ x + problem.model.B @ (decision.u - problem.model.u_op)
+        state = decision.state
+
+
+@every_method
+def test_a_measurement_that_is_no_number_holds_the_inputs_and_spoils_nothing(name):
+    problem, past, x, reference = instance(1)
+    controller = controller_of(problem, RULES["budget"], name)
+    before = decide(controller, past, x, reference)
+    held = decide(controller, past, np.full(3, np.nan), reference)
+    assert held.status is Status.HELD_BAD_MEASUREMENT
+    np.testing.assert_array_equal(held.u, past[-1])
+    assert same_decision(decide(controller, past, x, reference), before, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "value"),
+    [
+        ("exact", "time_limit", 0.0),
+        ("exact", "time_limit", -1.0),
+        ("alternating", "penalty", 0.0),
+        ("alternating", "tolerance", -1e-4),
+        ("alternating", "max_iterations", 0),
+        ("alternating", "warm_up", -1),
+        ("penalty_decomposition", "penalty", 0.0),
+        ("penalty_decomposition", "growth", 1.0),
+        ("penalty_decomposition", "tolerance", 0.0),
+        ("penalty_decomposition", "max_iterations", 1.5),
+        ("hard_thresholding", "tolerance", 0.0),
+        ("hard_thresholding", "max_iterations", 0),
+        ("admm", "penalty", -0.1),
+        ("admm", "starts", 0),
+        ("admm", "iterations", 0),
+        ("admm", "seed", -1),
+        ("l1", "reweightings", -1),
+        ("l1", "bisections", 0),
+        ("reweighted_l1", "reweightings", 101),
+        ("greedy", "penalty", 1.0),
+    ],
+)
+def test_settings_out_of_range_are_refused(name, setting, value):
+    with pytest.raises(MampcError, match=r"expected .*, received") as refused:
+        mampc.MAMPC(tank_problem(), RULES["budget"], method=name, **{setting: value})
+    assert setting in str(refused.value)
+
+
+@every_heuristic
+def test_a_name_and_an_object_with_the_same_settings_decide_alike(name):
+    problem, past, x, reference = instance(1)
+    named = decide(controller_of(problem, RULES["budget"], name), past, x, reference)
+    method = mampc.METHODS[name](**SETTINGS.get(name, {}))
+    given = decide(mampc.MAMPC(problem, RULES["budget"], method=method), past, x, reference)
+    assert same_decision(named, given)
