@@ -21,12 +21,23 @@ def is_usable(vector: Array) -> bool:
     return not vector.size or bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
 
 
-def as_shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    """Numbers of exactly this shape, finite or not and without a copy where possible; `MampcError` otherwise."""
+def as_read(name: str, value: Any) -> Array:
+    """Numbers as they come in the loop, finite or not and without a copy where possible.
+
+    Masked entries and None are not-a-number; what is no number at all raises `MampcError`.
+    """
     try:
+        if isinstance(value, np.ma.MaskedArray):
+            value = np.ma.filled(value.astype(np.float64), np.nan)
         array: Array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise MampcError(f"{name}: expected numbers of shape {shape}, received {_short(value)}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise MampcError(f"{name}: expected numbers, received {_short(value)}") from None
+    return array
+
+
+def as_shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """Numbers of exactly this shape, as `as_read` takes them; `MampcError` otherwise."""
+    array = as_read(name, value)
     if array.shape != shape:
         raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
     return array

@@ -121,7 +121,7 @@ class Regulator:
             MampcError: arguments that are no numbers or of the wrong shape.
         """
         start = perf_counter()
-        y = as_shaped("y", _unmasked(y), self._y_shape)
+        y = as_shaped("y", y, self._y_shape)
         memory, v_last = state.controller, state.measured_disturbance
         if u_applied is not None:
             memory = self._applied(memory, u_applied)
@@ -164,15 +164,8 @@ class Regulator:
     def _applied(self, memory: ControllerState, u_applied: Any) -> ControllerState:
         """The memory with the latest inputs put right; not-usable numbers change nothing."""
         decided = memory.inputs[-1]
-        u = _where_usable(as_shaped("u_applied", _unmasked(u_applied), decided.shape), decided)
+        u = _where_usable(as_shaped("u_applied", u_applied, decided.shape), decided)
         return replace(memory, inputs=np.concatenate([memory.inputs[:-1], u[None]]))
-
-
-def _unmasked(values: Any) -> Any:
-    """Masked entries as not-a-number."""
-    if isinstance(values, np.ma.MaskedArray):
-        return np.ma.filled(values.astype(np.float64), np.nan)
-    return values
 
 
 def _where_usable(told: Array, otherwise: Array) -> Array:

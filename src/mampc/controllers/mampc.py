@@ -18,11 +18,12 @@ from mampc.controllers.exact import Exact
 from mampc.controllers.greedy import Greedy
 from mampc.controllers.hard_thresholding import HardThresholding
 from mampc.controllers.l1 import L1, ReweightedL1
+from mampc.controllers.pattern_solver import ROUNDING, without_rounding
 from mampc.controllers.penalty_decomposition import PenaltyDecomposition
 from mampc.controllers.present import PresentLimits
 from mampc.errors import MampcError
 from mampc.instance import Instance
-from mampc.patterns import SAME, MoveRules
+from mampc.patterns import MoveRules
 from mampc.problem import TrackingProblem
 
 
@@ -136,12 +137,22 @@ class MAMPC(Controller):
         if search is None:
             return self._unrestricted(instance, state)
         if state.samples >= search.warm_up:
-            plan = _without_rounding(search.plan(instance, state))
+            plan = self._without_rounding(search.plan(instance, state), instance)
             return plan if self._margin is None else self._unless_urgent(plan, instance, state, self._margin)
         plan = self._unrestricted(instance, state)
         if plan.moves is None:
             return plan
         return plan._replace(status=Status.WARM_UP, lower_bound=-np.inf, objective=None)
+
+    def _without_rounding(self, plan: Plan, instance: Instance) -> Plan:
+        """The plan without moves that are too small to count."""
+        if plan.moves is None:
+            return plan
+        size = np.abs(plan.moves)
+        if np.count_nonzero(size > ROUNDING) == np.count_nonzero(size):
+            return plan
+        moves = without_rounding(self.condensed, instance, plan.moves)
+        return plan._replace(moves=moves, inputs=None, objective=None)
 
     def _unless_urgent(self, plan: Plan, instance: Instance, state: ControllerState, margin: Array) -> Plan:
         """The plan, or that of plain MPC where the rules would cost a violation beyond the margin."""
@@ -164,17 +175,6 @@ class MAMPC(Controller):
             inputs=None,
             remarks=(*plan.remarks, Remark.RULES_SUSPENDED),
         )
-
-
-def _without_rounding(plan: Plan) -> Plan:
-    """The plan with moves too small to count as moves made exactly zero."""
-    moves = plan.moves
-    if moves is None:
-        return plan
-    counted = np.abs(moves) > SAME
-    if np.count_nonzero(counted) == np.count_nonzero(moves):
-        return plan
-    return plan._replace(moves=moves * counted, inputs=None, objective=None)
 
 
 def method_of(method: str | Method, settings: Mapping[str, Any]) -> Method:

@@ -16,6 +16,7 @@ from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver
 
 MOST_KEPT = 4096  # patterns whose solvers are kept, some ten kilobytes each
+ROUNDING = 1e-8  # input units: a smaller move may be none
 SMALLER = 1e-8  # input units: a move that falls short of its least size by no more is rounded up to it
 
 
@@ -169,8 +170,8 @@ class PatternSolver:
             )
         moves = np.zeros(n)
         moves[pattern] = best
-        if len(best) and np.abs(best).min() < SMALLER:
-            moves = self._without_rounding(instance, moves)
+        if len(best) and np.abs(best).min() < ROUNDING:
+            moves = without_rounding(self.condensed, instance, moves)
             least += self.admissible.charge(moves != 0) - self.admissible.charge(pattern)
         return OnPattern(moves, least, status, multipliers, iterations)
 
@@ -190,16 +191,6 @@ class PatternSolver:
                 best.offer(self.solve(instance, fewer, best.objective, deadline))
         return solved
 
-    def _without_rounding(self, instance: Instance, moves: Array) -> Array:
-        """The moves with inputs exactly within their limits, and changes too small to count exactly zero."""
-        limits, u = self.condensed.problem.limits, instance.u_previous
-        changes = moves.reshape(-1, len(u)).copy()
-        wanted = np.clip(u + changes.cumsum(axis=0), limits.u_min, limits.u_max)
-        for j in np.flatnonzero(changes.any(axis=1)):
-            changes[j] = np.where(np.abs(wanted[j] - u) > SAME, wanted[j] - u, 0.0)
-            u = u + changes[j]
-        return changes.ravel()
-
     def _prepared(self, pattern: BoolArray) -> Prepared:
         key = pattern.tobytes()
         entry = self._kept.get(key)
@@ -210,6 +201,17 @@ class PatternSolver:
         else:
             self._kept.move_to_end(key)
         return entry
+
+
+def without_rounding(condensed: CondensedQP, instance: Instance, moves: Array) -> Array:
+    """The moves with inputs exactly within their limits, and changes too small to count exactly zero."""
+    limits, u = condensed.problem.limits, instance.u_previous
+    changes = moves.reshape(-1, len(u)).copy()
+    wanted = np.clip(u + changes.cumsum(axis=0), limits.u_min, limits.u_max)
+    for j in np.flatnonzero(changes.any(axis=1)):
+        changes[j] = np.where(np.abs(wanted[j] - u) > SAME, wanted[j] - u, 0.0)
+        u = u + changes[j]
+    return changes.ravel()
 
 
 def _apart(lower: Array, upper: Array, at: int, size: float, value: float) -> list[tuple[Array, Array]]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import LARGEST, Array, BoolArray, as_array
+from mampc.arrays import LARGEST, Array, BoolArray, as_read
 from mampc.condensing import CondensedQP
 from mampc.errors import MampcError
 from mampc.instance import Instance, PresentBounds
@@ -85,7 +85,7 @@ def _rows(name: str, value: Any, usual: Array, rows: int) -> Array:
     """A limit per sample and signal, shape (rows, signals); the usual one where nothing is told."""
     if value is None:
         return np.tile(usual, (rows, 1))
-    given = as_array(name, value)
+    given = as_read(name, value)
     if given.shape not in ((), usual.shape, (rows, *usual.shape)):
         raise MampcError(
             f"limits: expected {name} as a scalar, of shape {usual.shape} or {(rows, *usual.shape)}, "
