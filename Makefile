@@ -8,7 +8,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_LINK_MODE := copy
 export VIRTUAL_ENV := $(CURDIR)/.venv
 
-.PHONY: demo test lint format bench methods figures lock clean help
+.PHONY: demo test fuzz lint format bench methods figures lock clean help
 .DEFAULT_GOAL := help
 
 help:  ## what can be made
@@ -19,6 +19,9 @@ demo: .venv/run.stamp  ## run the quadruple-tank study: a table, results/quadrup
 
 test: .venv/dev.stamp  ## run the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+fuzz: .venv/dev.stamp  ## 100 000 fuzzed steps of the regulator
+	$(BIN)/python -m pytest tests/test_fuzz.py --hypothesis-profile long $(PYTEST_ARGS)
 
 lint: .venv/dev.stamp  ## style, types and the layers of imports
 	$(BIN)/ruff check .
