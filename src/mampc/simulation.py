@@ -80,21 +80,24 @@ class Run:
         return closed_loop_figure(self.t, self.u, self.y, self.r, self.names)
 
     def to_csv(self, path: str | Path) -> None:
-        """Write time, inputs, measured disturbances, outputs, references and status, in full precision."""
+        """Write time, inputs, measured disturbances, outputs, references, status, remarks and ignored outputs, in
+        full precision.
+        """
         inputs, outputs = self.names.inputs, self.names.outputs
         header = [
             "time", *inputs, *self.names.disturbances, *outputs,
             *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
-            "status", "objective", "iterations", "solve_time_us",
+            "status", "objective", "iterations", "solve_time_us", "remarks", "ignored",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
         with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)
             for row, d in zip(numbers, self.decisions, strict=True):
-                writer.writerow(
-                    [*row, d.status.value, d.objective, d.iterations, round(d.solve_time * 1e6, 2)]
-                )
+                writer.writerow([
+                    *row, d.status.value, d.objective, d.iterations, round(d.solve_time * 1e6, 2),
+                    " ".join(d.remarks), " ".join(f"{y}:{fault}" for y, fault in d.ignored_outputs.items()),
+                ])  # fmt: skip
 
 
 def simulate(
