@@ -344,12 +344,15 @@ class CondensedQP:
             c + min 1/2 d' H d + g' d, on any pattern.
         """
         v, n_simple = self.n_violations, self.program.n_simple
-        active = np.flatnonzero(multipliers)
-        pull = multipliers[active]
-        bound = np.where(pull > 0, instance.upper[active], instance.lower[active])
-        g = instance.f + multipliers[n_simple:] @ self.program.A
+        g = instance.f + multipliers[n_simple:].dot(self.program.A)
         g[:n_simple] += multipliers[:n_simple]
-        constant = instance.constant - pull @ bound - 0.5 * (g[:v] @ g[:v]) / self.problem.output_limit_weight
+        constant = (
+            instance.constant
+            - np.maximum(multipliers, 0.0).dot(instance.upper)
+            - np.minimum(multipliers, 0.0).dot(instance.lower)
+        )
+        if v:
+            constant -= 0.5 * g[:v].dot(g[:v]) / self.problem.output_limit_weight
         return g[v:], float(constant)
 
     def restricted(self, pattern: BoolArray) -> Restriction:

@@ -145,7 +145,7 @@ class KalmanFilter:
         at_rest = np.vstack([np.eye(n, n + l) - A[:n], C])
         wanted = np.concatenate([model.B @ change, as_vector("y", y, l) - model.y_op - model.D @ change])
         rest = np.linalg.lstsq(at_rest, wanted)[0]
-        return self._disturbed(replace(none, x=rest[:n]), rest[n:])
+        return self._disturbed(none, rest[:n], rest[n:])
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> Estimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since; what is estimated stays."""
@@ -174,13 +174,14 @@ class KalmanFilter:
             gain, innovation = self.gain_with(believed), np.where(believed, innovation, 0.0)
         correction = gain @ innovation
         n = self.model.n_states
-        return self._disturbed(replace(predicted, x=predicted.x + correction[:n]), correction[n:])
+        return self._disturbed(predicted, predicted.x + correction[:n], correction[n:])
 
-    def _disturbed(self, estimate: Estimate, further: Array) -> Estimate:
-        """The estimate with further disturbances, shape (l,)."""
+    def _disturbed(self, estimate: Estimate, x: Array, further: Array) -> Estimate:
+        """The estimate with another state x, shape (n,), and further disturbances, shape (l,)."""
+        at_outputs, at_inputs = estimate.output_disturbance, estimate.input_disturbance
         if self.directions is None:
-            return replace(estimate, output_disturbance=estimate.output_disturbance + further)
-        return replace(estimate, input_disturbance=estimate.input_disturbance + self.directions @ further)
+            return Estimate(x, at_outputs + further, at_inputs)
+        return Estimate(x, at_outputs, at_inputs + self.directions @ further)
 
     def _change(self, estimate: Estimate, u: Array, v: Array | None) -> Array:
         """All inputs of the model as differences from the operating point, shape (m + d,)."""

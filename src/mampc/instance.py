@@ -71,7 +71,7 @@ class Instance(Optimum):
         present: the bounds, where they are those of this sample alone; else None.
     """
 
-    __slots__ = ("manual", "parameter", "present", "u_previous")
+    __slots__ = ("_constant", "manual", "parameter", "present", "u_previous")
 
     def __init__(
         self,
@@ -82,10 +82,13 @@ class Instance(Optimum):
         manual: BoolArray | None = None,
         present: PresentBounds | None = None,
     ) -> None:
-        super().__init__(data, parts, None if present is None else present.margins(data[parts.moves]))
-        self.parameter, self.u_previous, self.manual, self.present = parameter, u_previous, manual, present
+        self.data, self.parts, self.parameter, self.u_previous = data, parts, parameter, u_previous
+        self.manual, self.present = manual, present
+        self._margins: Array | None = None
+        self._constant: float | None = None
         if present is not None:
             data[parts.lower], data[parts.upper] = present.lower, present.upper
+            self._margins = present.margins(data[parts.moves])
 
     @property
     def f(self) -> Array:
@@ -105,8 +108,10 @@ class Instance(Optimum):
     @property
     def constant(self) -> float:
         """The cost of no moves: |error|^2."""
-        error = self.data[self.parts.error]
-        return float(error.dot(error))
+        if self._constant is None:
+            error = self.data[self.parts.error]
+            self._constant = float(error.dot(error))
+        return self._constant
 
     @property
     def lower(self) -> Array:

@@ -52,7 +52,7 @@ class DaqpSolver:
             "iter_limit": iteration_limit,
             "time_limit": 0.0 if time_limit is None else time_limit,
         }
-        self._inactive = np.zeros(program.n_bounds)
+        self._inactive = np.zeros(program.n_bounds, dtype=np.intc)
         self._f_shape = (program.n_variables,)
         self._bound_shape = (program.n_bounds,)
         self._local = threading.local()
@@ -72,8 +72,8 @@ class DaqpSolver:
                 f"solve: expected f {self._f_shape} and bounds {self._bound_shape}, "
                 f"received {f.shape}, {lower.shape}, {upper.shape}"
             )
-        # lower <= upper is false for not-a-number too.
-        if not (np.isfinite(f).all() and (lower <= upper).all()):
+        # Both comparisons are false for not-a-number; f beyond 1e154 is as good as infinite.
+        if not (f.dot(f) < np.inf and (lower <= upper).all()):
             return _BAD_DATA
         if not len(lower):  # daqp wants at least one row
             return QPSolution(-np.linalg.solve(self.program.H, f), lower, QPStatus.OPTIMAL, 0)
@@ -82,14 +82,15 @@ class DaqpSolver:
             model = self._local.model = self._fresh_model()
             self._local.active = getattr(self._local, "active", None)
         # daqp reads memory as contiguous doubles and keeps references to it: hand it copies of its own.
+        changed: dict[str, Any] = {"f": _own(f), "blower": _own(lower), "bupper": _own(upper)}
         active, self._local.active = self._local.active, None
-        if active is None:
-            flag = model.update(f=_own(f), blower=_own(lower), bupper=_own(upper))
-        else:
+        if active is self._inactive:
+            changed["sense"] = active
+        elif active is not None:
             # A bound that went away since cannot be started from.
             there = np.where(active == ACTIVE_BELOW, lower > -UNBOUNDED, upper < UNBOUNDED)
-            sense = np.where(there, active, 0).astype(np.intc)
-            flag = model.update(f=_own(f), blower=_own(lower), bupper=_own(upper), sense=sense)
+            changed["sense"] = np.where(there, active, 0).astype(np.intc)
+        flag = model.update(**changed)
         if flag < 0:
             self._local.model = None
             return _BAD_DATA

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import LARGEST, Array, BoolArray, as_array, as_limit, as_vector, as_whole, is_usable
+from mampc.arrays import LARGEST, Array, BoolArray, as_array, as_limit, as_vector, as_whole
 from mampc.errors import MampcError
 from mampc.estimation import static_response
 from mampc.problem import TrackingProblem
@@ -133,11 +133,8 @@ class Sensors:
         Returns:
             Which outputs are believed, shape (l,); the fault of every other by its name; the next state.
         """
-        if (
-            is_usable(y)
-            and (np.abs(innovation) <= self._jump).all()
-            and ((y >= self._low) & (y <= self._high) & (y != state.y)).all()
-        ):  # the everyday case, at once
+        fine = (np.abs(innovation) <= self._jump) & (y != state.y) & (y >= self._low) & (y <= self._high)
+        if fine.all():  # the everyday case, at once
             return self._all, {}, SensorState(y.copy(), self._none, self._none, self._none)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))

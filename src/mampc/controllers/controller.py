@@ -259,10 +259,7 @@ class Controller(ABC):
             return self._but_for_manual(instance, instance.manual)
         margins = instance.margins
         if margins[margins.argmin()] > INSIDE:
-            return Plan(
-                instance.moves, Status.OPTIMAL, 0, None, None,
-                instance.inputs, instance.cost,
-            )  # fmt: skip
+            return Plan(instance.moves, Status.OPTIMAL, 0, None, None, instance.inputs, instance.cost)
         self._solver.start(state.active)
         solution = self._solver.solve(instance.f, instance.lower, instance.upper)
         if solution.z is None or solution.multipliers is None:

@@ -64,9 +64,11 @@ class ExactSearch:
         problem = condensed.problem
         self.settings, self.condensed = settings, condensed
         self.admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
-        self._solver = PatternSolver(condensed, self.admissible)
         self._relaxation = Relaxation(condensed)
         self._ranking = ranking_of(condensed, self.admissible)
+        # Ranking calls the solver only where the optimum without limits breaks one.
+        ranked = self._ranking is not None
+        self._solver = PatternSolver(condensed, self.admissible, limits_expected=ranked)
         if self._ranking is None:
             self._tree = PatternTree(condensed, self.admissible)
             self._local = LocalSearch(condensed, self.admissible)
@@ -110,6 +112,7 @@ class ExactSearch:
                 np.maximum(bounds, ranking.bounds(limits[0], past) + limits[1], out=bounds)
 
         rank_again(sample.of_plain())
+        solved = None
         while True:
             index = int(bounds.argmin())
             bound = float(bounds[index])
@@ -117,16 +120,18 @@ class ExactSearch:
                 return self._plan(instance, best, best.objective)
             if perf_counter() > deadline:
                 return self._plan(instance, best, bound, Status.TIME_LIMIT)
+            if solved is not None:
+                rank_again(sample.priced(solved.multipliers))
+                # Where this pattern does not move, its multipliers say little: price the best ones left together.
+                few = bounds.argpartition(min(TOGETHER, len(bounds) - 1))[:TOGETHER]
+                rank_again(sample.relaxed(np.asarray(patterns[few].any(axis=0))))
+                solved = None
+                continue
             solved = self._solver.solve(instance, patterns[index], best.objective, deadline)
             best.offer(solved)
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(instance, best, bound, Status.TIME_LIMIT)
             bounds[index] = np.inf
-            if bounds[bounds.argmin()] < best.objective - tie:
-                rank_again(sample.priced(solved.multipliers))
-                # Where this pattern does not move, its multipliers say little: price the best ones left together.
-                few = bounds.argpartition(min(TOGETHER, len(bounds) - 1))[:TOGETHER]
-                rank_again(sample.relaxed(np.asarray(patterns[few].any(axis=0))))
 
     def _search_tree(self, instance: Instance, past: Past) -> Plan:
         """A good plan by local search, then the tree of everything that may beat it."""

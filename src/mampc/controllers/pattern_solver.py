@@ -90,13 +90,24 @@ class PatternSolver:
 
     Where moves have a least size, each must be at most -size or at least +size: a small search over
     signs, those of the optimum without least sizes first.
+
+    Args:
+        condensed, admissible: the problem and its rules.
+        limits_expected: whether plans mostly run into limits, so that it does not pay to try the optimum without
+            them first. (Where they do not, it spares setting up a solver for every new pattern.)
+        most_programs: that a search over signs may take.
     """
 
     def __init__(
-        self, condensed: CondensedQP, admissible: Admissible, *, most_programs: float = np.inf
+        self,
+        condensed: CondensedQP,
+        admissible: Admissible,
+        *,
+        limits_expected: bool = False,
+        most_programs: float = np.inf,
     ) -> None:
         self.condensed, self.admissible = condensed, admissible
-        self._most_programs = most_programs
+        self._limits_expected, self._most_programs = limits_expected, most_programs
         self._kept: OrderedDict[bytes, Prepared] = OrderedDict()
 
     def solve(
@@ -116,10 +127,11 @@ class PatternSolver:
         v, n = self.condensed.n_violations, self.condensed.n_moves
         if not pattern.any() and not v:
             return OnPattern(np.zeros(n) if base < cutoff else None, base, QPStatus.OPTIMAL, None, 0)
-        prepared, sizes = self._prepared(pattern), self.admissible.min_size[pattern]
-        d = prepared.unlimited(
-            instance.f_moves, instance.lower[v:], instance.upper[v:], sizes if self.admissible.sized else None
-        )
+        prepared = self._prepared(pattern)
+        sizes = self.admissible.min_size[pattern] if self.admissible.sized else None
+        d = None
+        if not self._limits_expected:
+            d = prepared.unlimited(instance.f_moves, instance.lower[v:], instance.upper[v:], sizes)
         if d is not None:
             objective = base + 0.5 * float(instance.f_moves[prepared.chosen].dot(d))
             moves: Array | None = None
@@ -156,7 +168,7 @@ class PatternSolver:
             if objective >= least:
                 continue
             d = z[v:]
-            if self.admissible.sized and len(d):
+            if sizes is not None and len(d):
                 short = sizes - np.abs(d)
                 worst = int(short.argmax())
                 if short[worst] > SMALLER:
@@ -172,7 +184,8 @@ class PatternSolver:
         moves[pattern] = best
         if len(best) and np.abs(best).min() < ROUNDING:
             moves = without_rounding(self.condensed, instance, moves)
-            least += self.admissible.charge(moves != 0) - self.admissible.charge(pattern)
+            if self.admissible.priced:
+                least += self.admissible.charge(moves != 0) - self.admissible.charge(pattern)
         return OnPattern(moves, least, status, multipliers, iterations)
 
     def offer(
@@ -206,12 +219,11 @@ class PatternSolver:
 def without_rounding(condensed: CondensedQP, instance: Instance, moves: Array) -> Array:
     """The moves with inputs exactly within their limits, and changes too small to count exactly zero."""
     limits, u = condensed.problem.limits, instance.u_previous
-    changes = moves.reshape(-1, len(u)).copy()
-    wanted = np.clip(u + changes.cumsum(axis=0), limits.u_min, limits.u_max)
-    for j in np.flatnonzero(changes.any(axis=1)):
-        changes[j] = np.where(np.abs(wanted[j] - u) > SAME, wanted[j] - u, 0.0)
-        u = u + changes[j]
-    return changes.ravel()
+    inputs = u + moves.reshape(-1, len(u)).cumsum(axis=0)
+    inputs = np.concatenate((u[None], np.minimum(np.maximum(inputs, limits.u_min), limits.u_max)))
+    changes: Array = (inputs[1:] - inputs[:-1]).ravel()
+    changes[np.abs(changes) <= SAME] = 0.0
+    return changes
 
 
 def _apart(lower: Array, upper: Array, at: int, size: float, value: float) -> list[tuple[Array, Array]]:
