@@ -298,3 +298,15 @@ def test_inputs_without_limits_stay_within_what_counts_as_a_number(rules):
     decision = controller.step(controller.initial_state(), [9e11], [-9e11])
     assert np.abs(decision.plan).max() == LARGEST / 2
     assert not controller.step(decision.state, [0.0], [0.0]).held
+
+
+def test_a_penalty_grows_no_further_than_a_solver_can_follow():
+    """Copies that are too large to agree to the tolerance let it grow without end."""
+    model = mampc.StateSpace([[0.6]], [[1.0, 0.5, 0.4]], [[1.0]], None, 1.0)
+    limits = mampc.Limits(y_max=0.5)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=7, control_horizon=4, limits=limits, output_limit_weight=0.01
+    )
+    controller = mampc.MAMPC(problem, mampc.MoveRules(max_moves=1), method="penalty_decomposition")
+    for size in (1.0, 1e6, 1e11):
+        assert not controller.step(controller.initial_state(), [0.3 * size], [-size]).held
