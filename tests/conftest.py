@@ -1,10 +1,22 @@
 """Every optimal solve of every test is checked for its optimality conditions."""
 
+import sys
+
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 
 from mampc.qp import UNBOUNDED, QPStatus
 from mampc.qp_daqp import DaqpSolver
+
+# For tests/test_fuzz.py alone; other tests keep the settings that they state.
+settings.register_profile(
+    "short", max_examples=200, stateful_step_count=20, deadline=None, derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
+settings.register_profile(
+    "long", settings.get_profile("short"), max_examples=3000, derandomize=False, print_blob=True
+)
 
 TOLERANCE = 1e-8  # relative to the sizes of the data
 
@@ -40,3 +52,11 @@ def _every_optimal_solve_is_certified():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DaqpSolver, "solve", certified)
         yield
+
+
+def pytest_terminal_summary(terminalreporter):
+    """How many steps were fuzzed, and how they ended."""
+    fuzz = sys.modules.get("test_fuzz")
+    if fuzz is not None and fuzz.STEPPED:
+        ends = ", ".join(f"{count} {status}" for status, count in fuzz.STEPPED.most_common())
+        terminalreporter.write_line(f"{fuzz.STEPPED.total()} fuzzed steps of the regulator: {ends}")

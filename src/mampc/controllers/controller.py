@@ -73,6 +73,7 @@ class Controller(ABC):
         self._u_min = np.maximum(limits.u_min, -LARGEST / 2)
         self._u_max = np.minimum(limits.u_max, LARGEST / 2)
         self._u_range = list(zip(self._u_min.tolist(), self._u_max.tolist(), strict=True))
+        self._some_unlimited = bool(np.isinf([limits.u_min, limits.u_max]).any())
         self._du_max = limits.du_max if np.isfinite(limits.du_max).any() else None
         self._no_violations = np.zeros(model.n_outputs)
         self._unknown_violations = np.full(model.n_outputs, np.nan)
@@ -234,6 +235,8 @@ class Controller(ABC):
                 violations.setflags(write=False)
         else:
             inputs = inputs.reshape(self._shape)
+            if self._some_unlimited:
+                inputs = np.minimum(np.maximum(inputs, self._u_min), self._u_max)
         if planned_from is not state:  # the way back inside the limits is part of the plan, and unproven
             changes = changes.copy()
             changes[0] += planned_from.inputs[-1] - state.inputs[-1]

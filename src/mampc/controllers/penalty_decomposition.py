@@ -22,6 +22,7 @@ from mampc.patterns import MoveRules, Past
 from mampc.qp import QPStatus
 
 MOST_GROWTHS = 60
+LARGEST_CONDITION = 1e12  # of the program with the penalty: what a solver can still do
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,8 @@ class PenaltyDecompositionSearch(HeuristicSearch):
         super().__init__(settings, condensed, rules)
         self.settings = settings
         self._mu = settings.penalty * float(np.diag(condensed.H).mean())
-        self._first_steps: list[FirstStep] = []
+        self._first_steps = [FirstStep(condensed, self._mu)]
+        self._largest_mu = 0.25 * LARGEST_CONDITION * float(np.linalg.eigvalsh(condensed.program.H)[0])
 
     def _propose(
         self, instance: Instance, past: Past, guess: Array | None, best: Incumbent
@@ -66,6 +68,8 @@ class PenaltyDecompositionSearch(HeuristicSearch):
         v: Array = np.zeros(self.condensed.n_moves) if guess is None else guess
         for number in range(MOST_GROWTHS):
             if number == len(self._first_steps):
+                if self._first_steps[-1].mu * settings.growth > self._largest_mu:
+                    break
                 self._first_steps.append(FirstStep(self.condensed, self._mu * settings.growth**number))
             first_step = self._first_steps[number]
             mu = first_step.mu

@@ -1,0 +1,217 @@
+"""Random loops and the faults that befall them, for tests/test_fuzz.py."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import assume
+from hypothesis import strategies as st
+
+import mampc
+
+MOST = 3  # inputs and outputs
+SPARSE = {
+    "exact": {"time_limit": 0.1},
+    "alternating": {"polish": True, "warm_up": 0},
+    "greedy": {},
+    "penalty_decomposition": {},
+    "hard_thresholding": {},
+    "admm": {"starts": 2, "iterations": 10},
+    "l1": {},
+    "reweighted_l1": {"reweightings": 1, "bisections": 6},
+}
+EXTREMES = (
+    np.nan, np.inf, -np.inf, 1e308, -1.7e308, 1e300, 1e12, -1e12, 9.9e11, -9.9e11, 4e11, 1e9, -1e6, 5e-324, -0.0
+)  # fmt: skip
+NUMBERS = st.one_of(st.sampled_from(EXTREMES), st.floats(), st.floats(-1e3, 1e3), st.floats(-3.0, 3.0))
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What a regulator is built from; every call of `build` gives a fresh one."""
+
+    problem: mampc.TrackingProblem
+    rules: mampc.MoveRules | None
+    method: str
+    settings: dict[str, Any]
+    estimator: mampc.KalmanFilter
+    sensors: mampc.SensorChecks
+    max_blind_steps: int
+
+    @property
+    def exactly_sparse(self):
+        """Whether moves that the rules forbid are exactly zero."""
+        return self.rules is not None and (self.method != "alternating" or self.settings["polish"])
+
+    def build(self):
+        if self.rules is None:
+            controller = mampc.MPC(self.problem)
+        else:
+            controller = mampc.MAMPC(self.problem, self.rules, method=self.method, **self.settings)
+        return mampc.Regulator(
+            controller, self.estimator, sensors=self.sensors, max_blind_steps=self.max_blind_steps
+        )
+
+
+@st.composite
+def models(draw):
+    """Stable, integrating and mildly unstable models; with and without feedthrough and measured disturbances."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    m, l, d = draw(st.integers(1, MOST)), draw(st.integers(1, MOST)), draw(st.integers(0, 2))
+    n = max(l, draw(st.integers(1, 4)))
+    kind = draw(st.sampled_from(["stable", "stable", "integrating", "unstable"]))
+    poles = rng.uniform(-0.4, 0.95, n)
+    poles[0] = {"stable": poles[0], "integrating": 1.0, "unstable": rng.uniform(1.01, 1.15)}[kind]
+    modes = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    scale = draw(st.sampled_from([1.0, 1.0, 1e-3, 1e3]))  # engineering units of the outputs
+    B, C = rng.standard_normal((n, m + d)), scale * rng.standard_normal((l, n))
+    D = scale * rng.standard_normal((l, m + d)) if draw(st.booleans()) else None
+    names = [
+        tuple(f"{letter}{i}" for i in range(count))
+        for letter, count in (("u", m), ("y", l), ("x", n), ("v", d))
+    ]
+    model = mampc.StateSpace(
+        modes @ np.diag(poles) @ modes.T, B, C, D, 1.0, rng.uniform(-2, 2, m), scale * rng.uniform(-2, 2, l),
+        names=mampc.Names(*names), v_op=rng.uniform(-2, 2, d),
+    )  # fmt: skip
+    integrating = kind == "integrating"
+    assume(not integrating or m >= l)
+    disturbance = "input" if integrating or (m >= l and draw(st.booleans())) else "output"
+    try:
+        estimator = mampc.KalmanFilter.offset_free(model, disturbance=disturbance)
+    except mampc.MampcError:
+        assume(False)
+    return model, estimator, scale
+
+
+@st.composite
+def limits(draw, model, scale):
+    """No limits, some, or all of them; inputs that cannot move at all."""
+    m, l = model.n_inputs, model.n_outputs
+    widths = st.lists(st.sampled_from([0.0, 0.3, 1.0, 5.0, 5.0, 50.0, np.inf]), min_size=m, max_size=m)
+    told = {}
+    if draw(st.integers(0, 3)):
+        told["u_min"] = model.u_op - draw(widths)
+        told["u_max"] = model.u_op + draw(widths)
+    if draw(st.booleans()):
+        told["du_max"] = draw(st.lists(st.sampled_from([0.0, 0.1, 0.5, 2.0, np.inf]), min_size=m, max_size=m))
+    for name, sign in (("y_min", -1.0), ("y_max", 1.0)):
+        if draw(st.booleans()):
+            width = st.sampled_from([0.0, 0.5, 2.0, np.inf])
+            told[name] = model.y_op + sign * scale * np.array(draw(st.lists(width, min_size=l, max_size=l)))
+    return mampc.Limits(**told)
+
+
+@st.composite
+def move_rules(draw, n_c):
+    """Move rules in any combination; least sizes that fit the limits are drawn with these."""
+    return {
+        "max_moves": draw(st.one_of(st.none(), st.integers(0, 4))),
+        "sparsity_horizon": draw(st.integers(1, 6)),
+        "price": draw(st.sampled_from([0.0, 0.0, 0.1, 3.0])),
+        "counting": draw(st.sampled_from(["elementwise", "simultaneous"])),
+        "dwell": draw(st.sampled_from([1, 1, 2, 4])),
+        "max_moves_per_step": draw(st.sampled_from([None, None, 1, 2])),
+        "blocks": draw(st.sampled_from([None, None, (1,), (1, n_c - 1) if n_c > 1 else (1,)])),
+    }
+
+
+@st.composite
+def loops(draw):
+    """A regulator: problem, rules and method, estimator and sensor checks."""
+    model, estimator, scale = draw(models())
+    n_c, told = draw(st.integers(1, 4)), draw(limits(model, scale))
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=n_c + draw(st.integers(0, 6)), control_horizon=n_c,
+        output_weight=1 / scale**2, move_weight=draw(st.sampled_from([0.01, 0.1, 1.0])), limits=told,
+        tail_horizon=draw(st.sampled_from([0.0, 0.0, 2.0])),
+        output_limit_weight=draw(st.sampled_from([1e2, 1e4])),
+    )  # fmt: skip
+    rules, method, settings = None, draw(st.sampled_from(["mpc", "alternating", "exact", *SPARSE])), {}
+    if method != "mpc":
+        settings = dict(SPARSE[method])
+        if method == "alternating" and draw(st.booleans()):
+            settings = {"polish": False, "max_iterations": draw(st.sampled_from([3, 500]))}
+        settings["on_limit_violation"] = draw(st.sampled_from(["keep_budget", "ignore_budget"]))
+        size, checked = draw(st.sampled_from([0.0, 0.0, 0.05, 0.4])), problem.limits
+        most = np.minimum(checked.du_max, checked.u_max - checked.u_min).min()
+        rules = mampc.MoveRules(**draw(move_rules(n_c)), min_size=size if size <= most else 0.0)
+    with_range = draw(st.booleans())
+    sensors = mampc.SensorChecks(
+        y_low=model.y_op - 20 * scale if with_range else None,
+        y_high=model.y_op + 20 * scale if with_range else None,
+        largest_jump=draw(st.sampled_from([None, None, np.inf, scale, 0.1 * scale])),
+        confirm=draw(st.integers(1, 4)), stuck_after=draw(st.sampled_from([None, 2, 4])),
+    )  # fmt: skip
+    return Loop(problem, rules, method, settings, estimator, sensors, draw(st.sampled_from([0, 0, 2, 5])))
+
+
+# Faults. Each is drawn for as many signals as there can be, and cut to those that there are.
+
+
+def per_signal(strategy):
+    return st.tuples(*[strategy] * MOST)
+
+
+# How a healthy value is spoilt: (kind, number).
+SPOILT = per_signal(
+    st.one_of(
+        st.just(("healthy", 0.0)),
+        st.tuples(st.sampled_from(["value", "added", "masked"]), NUMBERS),
+        st.sampled_from([("stuck", 0.0), ("none", 0.0), ("value", np.nan)]),
+    )
+)
+
+
+def spoilt(healthy, faults, last):
+    """Healthy values (k,) with faults, as a list or masked array, and the numbers that are to be read from it."""
+    read, given, masked = [], [], []
+    for value, (kind, number), before in zip(healthy.tolist(), faults[: len(healthy)], last, strict=True):
+        with np.errstate(over="ignore"):
+            told = {
+                "healthy": value, "value": number, "masked": number, "stuck": before, "none": None,
+                "added": float(np.float64(value) + number),
+            }[kind]  # fmt: skip
+        given.append(told)
+        masked.append(kind == "masked")
+        read.append(np.nan if told is None or masked[-1] else told)
+    if any(masked):
+        given = np.ma.masked_array([np.nan if v is None else v for v in given], masked)
+    return given, np.array(read)
+
+
+# Limits told at run time: for each of the five how (None: not at all) and numbers relative to the operating point.
+SHAPES = st.sampled_from([None, None, None, "scalar", "signals", "rows"])
+NEAR = st.one_of(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), NUMBERS)
+PRESENT = st.fixed_dictionaries(
+    {
+        name: st.tuples(SHAPES, st.tuples(NEAR, NEAR, NEAR, NEAR))
+        for name in ("u_min", "u_max", "du_max", "y_min", "y_max")
+    }
+)
+
+
+def present_limits(problem, told):
+    """Limits of one sample, for signals that have such limits in the problem, as `Controller.step` asks."""
+    usual, given = problem.limits, {}
+    inputs = np.isfinite(usual.u_min) | np.isfinite(usual.u_max)
+    moves = np.full(len(inputs), bool(np.isfinite(usual.du_max).any()))
+    for name, (shape, numbers) in told.items():
+        own = getattr(usual, name)
+        known = {"u": inputs, "d": moves}.get(name[0], np.isfinite(own))
+        if shape is None or not known.any():
+            continue
+        centre = {"u": problem.model.u_op, "d": np.zeros(len(own)), "y": problem.model.y_op}[name[0]]
+        side = {"min": -1.0, "max": 1.0}[name[-3:]]
+        rows = problem.prediction_horizon if name[0] == "y" else problem.control_horizon
+        varied = np.resize(np.array(numbers), (rows, len(own)))
+        with np.errstate(over="ignore"):
+            values = np.where(np.abs(varied) <= 2.0, centre + side + varied, varied)
+        values = np.where(known, values, np.nan)
+        if shape == "rows":
+            given[name] = values
+        elif shape == "signals" or not known.all():
+            given[name] = values[0]
+        else:
+            given[name] = float(values[0, 0])
+    return mampc.Limits(**given)
