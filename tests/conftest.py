@@ -11,7 +11,7 @@ from mampc.qp_daqp import DaqpSolver
 
 # For tests/test_fuzz.py alone; other tests keep the settings that they state.
 settings.register_profile(
-    "short", max_examples=200, stateful_step_count=20, deadline=None, derandomize=True,
+    "short", max_examples=100, stateful_step_count=20, deadline=None, derandomize=True,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 settings.register_profile(
