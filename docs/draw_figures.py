@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from mampc.drawing import styled
 from mampc.report.figures import study_figures
 from mampc.study import load_study, run_study
 
@@ -14,7 +15,8 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     for name, figure in study_figures(result):
         if name in SHOWN:
-            figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None})
+            with styled():
+                figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":

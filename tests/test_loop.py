@@ -140,6 +140,15 @@ def test_applied_inputs_that_are_not_known_are_taken_to_be_those_decided(unknown
     )
 
 
+def test_applied_inputs_far_beyond_any_actuator_are_taken_to_be_those_decided():
+    model = stable_model()
+    loop = regulator(model, limits=mampc.Limits(u_min=model.u_op - 5.0, u_max=model.u_op + 5.0))
+    arguments = loop.initial_state(), model.y_op + 0.1, model.y_op
+    assert same_decision(loop.step(*arguments, u_applied=[4e9, -4e9]), loop.step(*arguments))
+    by_hand = loop.step(*arguments, u_applied=model.u_op + 30.0)
+    assert not np.allclose(by_hand.state.estimate.x, loop.step(*arguments).state.estimate.x)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
 @pytest.mark.filterwarnings("error")
 def test_a_bad_measurement_holds_the_inputs_and_the_loop_recovers(bad):

@@ -19,6 +19,9 @@ from mampc.regulator_state import RegulatorState
 from mampc.sensors import SensorChecks
 
 
+ABSURD = 100.0  # times the range of an input: no actuator is that far outside
+
+
 class Regulator:
     """Output feedback: a controller fed by an estimator, which believes what passes the sensor checks.
 
@@ -54,6 +57,11 @@ class Regulator:
         self.estimator = KalmanFilter.offset_free(model) if estimator is None else estimator
         self._sensors = (SensorChecks() if sensors is None else sensors).fitted(controller.problem)
         self._v_shape = (model.n_disturbances,)
+        limits = controller.problem.limits
+        apart = limits.u_max - limits.u_min
+        beyond = np.where(apart > 0, ABSURD * apart, LARGEST)
+        self._u_low = np.maximum(limits.u_min - beyond, -LARGEST)
+        self._u_high = np.minimum(limits.u_max + beyond, LARGEST)
         expected, received = _sizes(model), _sizes(self.estimator.model)
         if received != expected:
             raise MampcError(f"estimator: expected a model with {expected}, received {received}")
@@ -111,7 +119,8 @@ class Regulator:
                 inputs are held (see `max_blind_steps`).
             reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
             u_applied: what the plant really got since the last step, shape (m,), if not what was decided:
-                a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided.
+                a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided, and so does
+                a value a hundred times further outside its limits than these are apart.
             measured_disturbance: now, shape (d,), in engineering units; predicted to stay as it is.
                 Left out or not usable, the last one holds on.
             limits, manual: see `Controller.step`. Tell `u_applied` while an input is in manual; when it is
@@ -164,7 +173,8 @@ class Regulator:
     def _applied(self, memory: ControllerState, u_applied: Any) -> ControllerState:
         """The memory with the latest inputs put right; not-usable numbers change nothing."""
         decided = memory.inputs[-1]
-        u = _where_usable(as_shaped("u_applied", u_applied, decided.shape), decided)
+        told = as_shaped("u_applied", u_applied, decided.shape)
+        u = np.where((told > self._u_low) & (told < self._u_high), told, decided)
         return replace(memory, inputs=np.concatenate([memory.inputs[:-1], u[None]]))
 
 
