@@ -52,6 +52,14 @@ def is_usable(values):
     return np.abs(np.nan_to_num(read(values), nan=np.inf)) < LARGEST
 
 
+def believable(applied, limits):
+    """Which applied inputs some actuator may have reached."""
+    apart = limits.u_max - limits.u_min
+    beyond = np.where(apart > 0, 100.0 * apart, LARGEST)
+    near = (applied > limits.u_min - beyond) & (applied < limits.u_max + beyond)
+    return near & is_usable(applied)
+
+
 def same_to_the_bit(a, b):
     return a.status is b.status and all(
         np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
@@ -185,7 +193,7 @@ class FaultyLoop(RuleBasedStateMachine):
         if applied is not None:
             before = self.history[-2] if len(self.history) > 1 else decided
             u_applied, told = fuzzing.spoilt(decided, applied, before)
-            self.history[-1] = np.where(np.abs(np.nan_to_num(told, nan=np.inf)) < LARGEST, told, decided)
+            self.history[-1] = np.where(believable(told, self.problem.limits), told, decided)
         arguments = {
             "u_applied": u_applied, "measured_disturbance": v, "limits": self.present, "manual": self.manual
         }  # fmt: skip

@@ -18,7 +18,6 @@ from mampc.problem import Limits
 from mampc.regulator_state import RegulatorState
 from mampc.sensors import SensorChecks
 
-
 ABSURD = 100.0  # times the range of an input: no actuator is that far outside
 
 
