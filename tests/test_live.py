@@ -213,6 +213,38 @@ def test_back_from_manual_there_is_no_bump(rules):
             np.testing.assert_allclose(u, by_hand, atol=1e-3)
 
 
+@pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=0.01)])
+@pytest.mark.parametrize("told", [None, mampc.Limits(u_max=60.0)])
+def test_an_input_held_outside_its_limits_by_hand_is_predicted_where_it_is(rules, told):
+    """u1 is held at 70 by hand: its limit, of the problem or of this sample, is not where it is."""
+    limits = mampc.Limits(u_min=0.0, u_max=65.0 if told is None else 100.0)
+    problem = tank_problem(identified_tank(), prediction_horizon=30, limits=limits, tail_horizon=500.0)
+    controller, model = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules), problem.model
+    regulator, u = mampc.Regulator(controller), np.array([70.0, 40.0])
+    x, state = model.steady_state(u), regulator.initial_state(u)
+    wanted = model.y_op + model.dc_gain() @ (np.array([70.0, 37.0]) - model.u_op)
+    for _ in range(120):
+        decision = regulator.step(
+            state, model.y_op + model.C @ x, wanted, u_applied=u, manual=[True, False], limits=told
+        )
+        assert decision.u[0] == (65.0 if told is None else 60.0)
+        assert not decision.remarks
+        state, u = decision.state, np.array([70.0, decision.u[1]])
+        x = model.A @ x + model.B @ (u - model.u_op)
+    np.testing.assert_allclose(u[1], 37.0, atol=1e-3 if rules is None else 0.5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_way_back_inside_is_all_that_an_input_moves_by_where_moves_are_limited(method):
+    model = mampc.StateSpace([[0.9]], [[0.5]], [[1.0]], None, 1.0)
+    limits = mampc.Limits(u_min=0.0, u_max=10.0, du_max=2.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=10, control_horizon=4, limits=limits)
+    controller = controller_of(method, problem)
+    decision = controller.step(controller.initial_state([-1.0]), [0.0], [20.0])
+    assert 0.0 <= decision.u[0] <= 1.0
+    np.testing.assert_allclose(decision.plan[:, 0] - [-1.0, *decision.plan[:-1, 0]], decision.changes[:, 0])
+
+
 def test_moves_made_by_hand_count_in_the_window():
     problem = tank_problem(identified_tank())
     rules = mampc.MoveRules(max_moves=2, sparsity_horizon=4)

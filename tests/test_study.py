@@ -189,9 +189,13 @@ def test_a_list_of_files_that_leads_out_of_its_folder_is_not_believed(tmp_path):
 def test_what_a_killed_run_left_half_written_is_cleared_away(tmp_path):
     target = tmp_path / "out"
     target.mkdir()
+    (target / ".mampc-files").write_text("a.csv\n")
     (target / ".a.csv.partial-999999999").write_text("half")
+    (target / ".notes.partial-999999999").write_text("not ours")
+    (target / ".a.csv.partial-draft").write_text("not ours")
     ResultFolder(target, last="summary.json")
-    assert list(target.iterdir()) == []
+    left = {path.name for path in target.iterdir()}
+    assert left == {".mampc-files", ".notes.partial-999999999", ".a.csv.partial-draft"}
 
 
 def test_a_study_that_does_not_fit_leaves_the_last_results_alone(tmp_path):

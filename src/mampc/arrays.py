@@ -124,6 +124,13 @@ def as_whole(name: str, value: Any, minimum: int, maximum: int | None = None) ->
     return int(value)
 
 
+def as_flag(name: str, value: Any) -> bool:
+    """True or false; raises `MampcError` for anything else, such as the text "no"."""
+    if not isinstance(value, bool):
+        raise MampcError(f"{name}: expected true or false, received {value!r}")
+    return value
+
+
 def as_number(name: str, value: Any, minimum: float = -np.inf, *, exclusive: bool = False) -> float:
     """A finite number of at least `minimum` (above it when `exclusive`); raises `MampcError`."""
     number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)

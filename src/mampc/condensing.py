@@ -28,7 +28,7 @@ import numpy as np
 
 from mampc.arrays import Array, BoolArray, ComplexArray, as_shaped
 from mampc.errors import MampcError
-from mampc.instance import Instance, Parts, PatternOptimum
+from mampc.instance import Indices, Instance, Parts, PatternOptimum
 from mampc.problem import TrackingProblem
 from mampc.qp import UNBOUNDED, QuadraticProgram
 
@@ -39,8 +39,8 @@ class Restriction(NamedTuple):
     """A program on some of the moves (the others are zero), and where its data stand in the full one."""
 
     program: QuadraticProgram
-    columns: np.ndarray[tuple[int], np.dtype[np.intp]]
-    bounds: np.ndarray[tuple[int], np.dtype[np.intp]]
+    columns: Indices
+    bounds: Indices
 
 
 class CondensedQP:
@@ -306,10 +306,10 @@ class CondensedQP:
             v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
         return np.concatenate((x, u_previous, d_u, d_y, v, one, reference))
 
-    def instance(self, parameter: Array, u_previous: Array, manual: BoolArray | None = None) -> Instance:
-        """The data of one sample, from its `parameter`; inputs in `manual`, shape (m,), may not move."""
+    def instance(self, parameter: Array, u_previous: Array, rest: Indices | None = None) -> Instance:
+        """The data of one sample, from its `parameter`; `rest` as in `Instance`."""
         maps = self._constant_map if len(parameter) == self._constant_map.shape[1] else self._preview_map
-        return Instance(maps.dot(parameter), self.parts, parameter, u_previous, manual)
+        return Instance(maps.dot(parameter), self.parts, parameter, u_previous, rest)
 
     def cost(self, instance: Instance, moves: Array) -> float:
         """Tracking cost plus move weights plus output-limit penalty of the moves d, shape (n_moves,)."""

@@ -67,11 +67,11 @@ class Instance(Optimum):
     Attributes:
         parameter: p.
         u_previous: shape (m,).
-        manual: which inputs may not move, being in manual, shape (m,); None for no input.
+        rest: samples that each input may not move for, whatever the rules say, shape (m,); None for none.
         present: the bounds, where they are those of this sample alone; else None.
     """
 
-    __slots__ = ("_constant", "manual", "parameter", "present", "u_previous")
+    __slots__ = ("_constant", "parameter", "present", "rest", "u_previous")
 
     def __init__(
         self,
@@ -79,11 +79,11 @@ class Instance(Optimum):
         parts: Parts,
         parameter: Array,
         u_previous: Array,
-        manual: BoolArray | None = None,
+        rest: Indices | None = None,
         present: PresentBounds | None = None,
     ) -> None:
         self.data, self.parts, self.parameter, self.u_previous = data, parts, parameter, u_previous
-        self.manual, self.present = manual, present
+        self.rest, self.present = rest, present
         self._margins: Array | None = None
         self._constant: float | None = None
         if present is not None:

@@ -38,7 +38,7 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     stable = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0) < 1 - 1e-9
     if not promised or not stable or m < l:
         return nothing
-    gain = model.C @ np.linalg.solve(np.eye(model.n_states) - model.A, model.B[:, :m]) + model.D[:, :m]
+    gain = model.dc_gain()[:, :m]
     if np.linalg.matrix_rank(gain) < l:
         return nothing
     to_target = np.linalg.pinv(gain)  # moves per unit of offset

@@ -143,8 +143,11 @@ class Admissible:
         free = self.rules.max_moves is None and self.rules.dwell == 1 and self.per_step == self.n_inputs
         return free and bool(self.candidates.all()) and not self.priced and not self.sized
 
-    def past(self, inputs: Array, manual: BoolArray | None = None) -> Past:
-        """What the applied inputs, shape (h, m) with the latest last, leave; those in manual, (m,), rest."""
+    def past(self, inputs: Array, resting: Any = None) -> Past:
+        """What the applied inputs, shape (h, m) with the latest last, leave.
+
+        `resting`: samples that each input has to rest for besides, shape (m,), or None.
+        """
         rules = self.rules
         left, exceeded, rest = self._most, False, self._at_rest
         if rules.max_moves is not None:
@@ -157,8 +160,8 @@ class Admissible:
             moved = _moved(inputs[-rules.dwell :])[::-1]  # moved[t]: t + 1 samples before the next decision
             since = np.where(moved.any(axis=0), moved.argmax(axis=0) + 1, rules.dwell)
             rest = tuple((rules.dwell - since).tolist())
-        if manual is not None:
-            rest = tuple(np.where(manual, self.control_horizon, rest).tolist())
+        if resting is not None:
+            rest = tuple(np.maximum(resting, rest).tolist())
         return Past(left, rest, exceeded)
 
     def open(self, past: Past) -> BoolArray:

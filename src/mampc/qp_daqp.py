@@ -30,9 +30,9 @@ class DaqpSolver:
     """Solves one `QuadraticProgram` again and again for new f and bounds.
 
     Safe to share between threads (each gets its own daqp workspace) and to pickle (the workspace is
-    rebuilt). A failed solve throws the workspace away, so that it cannot spoil the next one. A
-    solve starts from the active bounds of the last one, which shows in the last digits of its answer; `start`
-    begins a sequence whose answers depend on its data alone.
+    rebuilt). A failed solve throws the workspace away, so that it cannot spoil the next one. By itself a
+    solve starts from the active bounds of the last one, which shows in the last digits of its answer. `start`,
+    which every method calls, begins a sequence of solves whose answers depend on their data alone.
 
     Args:
         program: the constant part.
@@ -135,6 +135,11 @@ def active_bounds(multipliers: Array) -> Array:
     """Which bounds hold a solution with these multipliers: 1 at an upper, 3 at a lower bound, else 0."""
     active: Array = (multipliers > 0) + ACTIVE_BELOW * (multipliers < 0)
     return active.astype(np.float64)
+
+
+def active_flags(active: Array | None) -> bool:
+    """Whether an array is one that `active_bounds` may have given, or None."""
+    return active is None or bool(np.isin(active, (0.0, 1.0, ACTIVE_BELOW)).all())
 
 
 def _own(array: Array) -> Array:

@@ -15,6 +15,7 @@ from mampc.errors import MampcError
 from mampc.estimation import KalmanFilter
 from mampc.lti import StateSpace
 from mampc.problem import Limits
+from mampc.qp_daqp import active_flags
 from mampc.regulator_state import RegulatorState
 from mampc.sensors import SensorChecks
 
@@ -94,8 +95,13 @@ class Regulator:
             "controller.active": (self.controller.condensed.program.n_bounds,),
         }
         for place, shape in state.shapes().items():
-            if shape != expected[place] and shape is not None:
+            may_be_none = place in ("controller.guess", "controller.active")
+            if shape != expected[place] and not (may_be_none and shape is None):
                 raise MampcError(f"state: expected {place} of shape {expected[place]}, received {shape}")
+        if not active_flags(state.controller.active):
+            raise MampcError(
+                f"state: expected flags at controller.active, received {state.controller.active}"
+            )
         return state
 
     def step(

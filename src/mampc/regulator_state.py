@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array
+from mampc.arrays import Array, as_whole
 from mampc.controllers.decision import ControllerState
 from mampc.errors import MampcError
 from mampc.estimation import Estimate
@@ -53,9 +53,10 @@ class RegulatorState:
             )
         except MampcError:
             raise
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
+            shown = text if len(text) < 60 else f"{text[:57]}..."
             raise MampcError(
-                f"state: expected what RegulatorState.to_json writes, received: {error!r}"
+                f"state: expected what RegulatorState.to_json writes, received {shown}"
             ) from None
 
     def shapes(self) -> dict[str, tuple[int, ...] | None]:
@@ -69,12 +70,14 @@ class RegulatorState:
 
 
 def _numbers(place: str, value: Any) -> Any:
-    """Lists of numbers as arrays; dictionaries entry by entry; numbers and None as they are."""
+    """Lists of numbers as arrays; dictionaries entry by entry; counts and None as they are."""
     if isinstance(value, dict):
         return {name: _numbers(f"{place}.{name}", entry) for name, entry in value.items()}
     if value is None:
         return None
+    if not isinstance(value, list):
+        return as_whole(f"state: {place}", value, 0)
     array = np.array(value, dtype=np.float64)
     if not np.isfinite(array).all():
         raise MampcError(f"state: expected finite numbers at {place}, received {value}")
-    return array if isinstance(value, list) else value
+    return array

@@ -24,7 +24,10 @@ SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a regulator was told in T samples, and what it decided, in engineering units.
+    """What a regulator was told in T samples of a simulated run, and what it decided, in engineering units.
+
+    (Neither applied inputs that differ from the decided ones, nor limits of single samples, nor inputs in
+    manual; nor, with preview, a reference that goes on beyond the run.)
 
     Attributes:
         t: seconds, shape (T,).
@@ -137,5 +140,5 @@ def replay(
         ):
             both_unknown = was != was and now != now
             if not (both_unknown or abs(now - was) <= tolerance * max(1.0, abs(was))):
-                return Difference(k, t, name, repr(was), repr(now))
+                return Difference(k, t, name, repr(was), repr(float(now)))
     return None

@@ -41,6 +41,7 @@ class ADMM(Heuristic):
     seed: int = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         as_number("penalty", self.penalty, 0.0, exclusive=True)
         as_whole("starts", self.starts, 1, 1000)
         as_whole("iterations", self.iterations, 1)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mampc.arrays import Array, BoolArray, as_number, as_whole
+from mampc.arrays import Array, BoolArray, as_flag, as_number, as_whole
 from mampc.condensing import CondensedQP
 from mampc.controllers.controller import HELD_BY, Plan
 from mampc.controllers.decision import ControllerState, Status
@@ -55,6 +55,8 @@ class Alternating(Heuristic):
     warm_up: int | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        as_flag("polish", self.polish)
         as_number("penalty", self.penalty, 0.0, exclusive=True)
         as_number("tolerance", self.tolerance, 0.0, exclusive=True)
         as_whole("max_iterations", self.max_iterations, 1)
@@ -81,7 +83,7 @@ class AlternatingSearch(HeuristicSearch):
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """Algorithm 1 for one sample, from the guess that the last sample left (at first: v = 0)."""
-        past = self.admissible.past(state.inputs, instance.manual)
+        past = self.admissible.past(state.inputs, instance.rest)
         v = np.zeros(self.condensed.n_moves) if state.guess is None else state.guess.ravel()
         choose = self._second_step(state, past)
         settled = alternate(
@@ -94,7 +96,7 @@ class AlternatingSearch(HeuristicSearch):
         else:
             status = Status.FEASIBLE if self.settings.polish else Status.SETTLED
         guess = self._shifted(settled.v)
-        if not self.settings.polish and instance.manual is None:  # in manual, no move is a small one
+        if not self.settings.polish and instance.rest is None:  # at rest, not even a small move
             plan = Plan(settled.d, status, settled.rounds, guess=guess, remarks=self._remarks(past))
             return self._certified(plan, instance, state)
         pattern = settled.v != 0.0

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.arrays import LARGEST, Array, BoolArray, as_array, as_shaped, as_vector, is_usable
+from mampc.arrays import LARGEST, Array, BoolArray, as_array, as_number, as_shaped, as_vector, is_usable
 from mampc.condensing import CondensedQP
 from mampc.controllers.decision import ControllerState, Decision, Remark, Status
 from mampc.controllers.pattern_solver import PatternSolver
 from mampc.controllers.present import PresentLimits
 from mampc.errors import MampcError
-from mampc.instance import Instance
+from mampc.instance import Indices, Instance
 from mampc.patterns import MoveRules
 from mampc.problem import Limits, TrackingProblem
 from mampc.qp import QPStatus
@@ -54,6 +54,8 @@ class Plan(NamedTuple):
 class Controller(ABC):
     """A receding-horizon controller: `step` is pure, all memory is in the state it takes and returns.
 
+    Make one controller for each thread; states may go from one to the other.
+
     Args:
         problem: what to track, over which horizons, at what weights and within what limits.
         time_limit: seconds that one quadratic program may take; None for no limit.
@@ -66,8 +68,11 @@ class Controller(ABC):
             raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
         self.problem = problem
         self.condensed = CondensedQP(problem, bound_every_move=bound_every_move)
+        if time_limit is not None:
+            time_limit = as_number("time_limit", time_limit, 0.0, exclusive=True)
+        self._time_limit = time_limit
         self._solver = DaqpSolver(self.condensed.program, time_limit=time_limit)
-        self._in_manual: PatternSolver | None = None  # plain MPC while some inputs are in manual
+        self._resting: PatternSolver | None = None  # plain MPC while some inputs may not move
         limits, model = problem.limits, problem.model
         # Without limits of their own inputs still stay within what counts as a number.
         self._u_min = np.maximum(limits.u_min, -LARGEST / 2)
@@ -141,9 +146,13 @@ class Controller(ABC):
         start = perf_counter()
         x = as_shaped("x", x, self._x_shape)
         constant, previewed = self._reference_shapes
-        reference = as_shaped("reference", reference, constant if np.ndim(reference) == 1 else previewed)
+        depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
+        reference = as_shaped("reference", reference, constant if depth == 1 else previewed)
         present = None if limits is None else PresentLimits(limits, self.condensed)
-        held_by_hand = None if manual is None else self._manual(manual)
+        by_hand = None if manual is None else self._by_hand(manual)
+        if by_hand is not None:
+            present = self._released(state, present, by_hand)
+        rest = None if by_hand is None else np.where(by_hand, self.problem.control_horizon, 0)
         planned_from = self._planned_from(state, present)
         while True:
             u_previous = planned_from.inputs[-1]
@@ -153,7 +162,11 @@ class Controller(ABC):
             if not is_usable(parameter):
                 bad = Plan(None, Status.HELD_BAD_MEASUREMENT, 0)
                 return self._decide(bad, None, state, planned_from, present, start)
-            instance = self.condensed.instance(parameter, u_previous, held_by_hand)
+            if planned_from is not state and self._du_max is not None:
+                # The way back inside is all that these inputs may move by at once.
+                back = (u_previous != state.inputs[-1]) & np.isfinite(self._du_max)
+                rest = np.maximum(0 if rest is None else rest, back.astype(np.intp))
+            instance = self.condensed.instance(parameter, u_previous, rest)
             if present is not None:
                 if present.crossed:
                     crossed = Plan(None, Status.HELD_INFEASIBLE, 0)
@@ -167,10 +180,22 @@ class Controller(ABC):
                     continue
             return self._decide(plan, instance, state, planned_from, present, start)
 
-    def _manual(self, manual: Any) -> BoolArray | None:
+    def _by_hand(self, manual: Any) -> BoolArray | None:
         """Which inputs are in manual, None for no input."""
         flags = as_shaped("manual", manual, self._shape[1:]) != 0.0
         return flags if flags.any() else None
+
+    def _released(
+        self, state: ControllerState, present: PresentLimits | None, by_hand: BoolArray
+    ) -> PresentLimits | None:
+        """The limits of this sample, which are none for inputs that are held outside them by hand."""
+        u = state.inputs[-1]
+        low, high = (np.atleast_2d(limit) for limit in self._range(present))
+        if not (by_hand & ((u < low) | (u > high)).any(axis=0)).any():
+            return present
+        present = PresentLimits(Limits(), self.condensed) if present is None else present
+        present.release(by_hand)
+        return present
 
     def _planned_from(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
         """The state that plans start from; the state itself unless a method wants another."""
@@ -187,7 +212,9 @@ class Controller(ABC):
 
         That is a move like any other, so it stands in the window of the rules as the latest one.
         """
-        low, high = (np.atleast_2d(limit)[:1] for limit in self._range(present))
+        low, high = self._u_min, self._u_max
+        if present is not None and not present.crossed:
+            low, high = present.planned_min[:1], present.planned_max[:1]
         inside = np.minimum(np.maximum(state.inputs[-1:], low), high)
         if (inside == state.inputs[-1:]).all():
             return state
@@ -235,6 +262,8 @@ class Controller(ABC):
                 violations.setflags(write=False)
         else:
             inputs = inputs.reshape(self._shape)
+            if present is not None:
+                inputs = np.minimum(np.maximum(inputs, present.u_min), present.u_max)
             if self._some_unlimited:
                 inputs = np.minimum(np.maximum(inputs, self._u_min), self._u_max)
         if planned_from is not state:  # the way back inside the limits is part of the plan, and unproven
@@ -258,8 +287,8 @@ class Controller(ABC):
 
     def _unrestricted(self, instance: Instance, state: ControllerState) -> Plan:
         """Plain MPC: every move is free. Where no limit is active the optimum is at hand already."""
-        if instance.manual is not None:
-            return self._but_for_manual(instance, instance.manual)
+        if instance.rest is not None:
+            return self._while_resting(instance, instance.rest)
         margins = instance.margins
         if margins[margins.argmin()] > INSIDE:
             return Plan(instance.moves, Status.OPTIMAL, 0, None, None, instance.inputs, instance.cost)
@@ -272,12 +301,22 @@ class Controller(ABC):
             active=active_bounds(solution.multipliers),
         )  # fmt: skip
 
-    def _but_for_manual(self, instance: Instance, manual: BoolArray) -> Plan:
-        """Plain MPC of the inputs that are not in manual."""
-        if self._in_manual is None:
-            m, n_c = len(manual), self.problem.control_horizon
-            self._in_manual = PatternSolver(self.condensed, MoveRules().fitted(m, n_c))
-        solved = self._in_manual.solve(instance, np.tile(~manual, self.problem.control_horizon))
+    def _while_resting(self, instance: Instance, rest: Indices) -> Plan:
+        """Plain MPC where some inputs may not move for some samples."""
+        m, n_c = len(rest), self.problem.control_horizon
+        if self._resting is None:
+            self._resting = PatternSolver(
+                self.condensed, MoveRules().fitted(m, n_c), time_limit=self._time_limit
+            )
+        solved = self._resting.solve(instance, (np.arange(n_c)[:, None] >= rest).ravel())
         if solved.moves is None:
             return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.iterations)
         return Plan(solved.moves, Status.OPTIMAL, solved.iterations, None, objective=solved.objective)
+
+
+def _dimensions(values: Any) -> int:
+    """How deep lists are nested; 1 for ragged ones, which no shape fits."""
+    try:
+        return np.ndim(values)
+    except ValueError:
+        return 1

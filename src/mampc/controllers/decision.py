@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mampc.arrays import Array, BoolArray
+from mampc.patterns import SAME
 from mampc.sensors import Fault
 from mampc.sentences import Sentence
 
@@ -112,8 +113,8 @@ class Decision:
 
     @cached_property
     def moves(self) -> BoolArray:
-        """Which planned changes are moves (not zero), shape (nc, m)."""
-        moves: BoolArray = self.changes != 0.0
+        """Which planned changes are moves (larger than rounding), shape (nc, m)."""
+        moves: BoolArray = np.abs(self.changes) > SAME
         return moves
 
     @property

@@ -75,7 +75,7 @@ class ExactSearch:
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """The best moves of all admissible patterns for one sample."""
-        past = self.admissible.past(state.inputs, instance.manual)
+        past = self.admissible.past(state.inputs, instance.rest)
         if past.exceeded:
             return self._search(instance, past)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
         return self._search(instance, past)
@@ -92,7 +92,7 @@ class ExactSearch:
             if not len(margins) or margins[margins.argmin()] > INSIDE:
                 return Plan(
                     optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs,
-                    optimum.cost + ranking.charge[best],
+                    optimum.cost + float(ranking.charge[best]),
                 )  # fmt: skip
         return self._search_ranking(ranking, bounds, instance, past)
 
@@ -161,6 +161,8 @@ class ExactSearch:
             if best.failure is not None:
                 return Plan(None, HELD_BY[best.failure], best.solved)
             hold = np.zeros(self.condensed.n_moves)
+            if instance.present is not None and instance.present.on(hold != 0) is None:
+                return Plan(None, Status.HELD_INFEASIBLE, best.solved)
             return Plan(hold, status, best.solved, bound)
         lower = None if status is Status.OPTIMAL else min(bound, best.objective)
         return Plan(best.moves, status, best.solved, lower, None, None, best.objective)

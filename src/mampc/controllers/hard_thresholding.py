@@ -32,6 +32,7 @@ class HardThresholding(Heuristic):
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         as_number("tolerance", self.tolerance, 0.0, exclusive=True)
         as_whole("max_iterations", self.max_iterations, 1)
 

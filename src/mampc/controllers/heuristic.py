@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mampc.arrays import Array
+from mampc.arrays import Array, as_flag
 from mampc.condensing import CondensedQP
 from mampc.controllers.controller import HELD_BY, INSIDE, Plan
 from mampc.controllers.decision import ControllerState, Remark, Status
@@ -32,6 +32,9 @@ class Heuristic(ABC):
 
     certify: bool = False
 
+    def __post_init__(self) -> None:
+        as_flag("certify", self.certify)
+
     @abstractmethod
     def prepare(self, condensed: CondensedQP, rules: MoveRules) -> HeuristicSearch:
         """The search for one problem and one set of rules."""
@@ -54,7 +57,7 @@ class HeuristicSearch:
 
     def plan(self, instance: Instance, state: ControllerState) -> Plan:
         """The best plan on any proposed pattern."""
-        past, best = self.admissible.past(state.inputs, instance.manual), Incumbent()
+        past, best = self.admissible.past(state.inputs, instance.rest), Incumbent()
         rounds, guess = 0, None
         if past.left:
             last = None if state.guess is None else state.guess.ravel()

@@ -41,6 +41,7 @@ class L1(Heuristic):
     bisections: int = 12
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         as_whole("reweightings", self.reweightings, 0, 100)
         as_whole("bisections", self.bisections, 1, 100)
 

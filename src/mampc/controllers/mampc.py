@@ -119,9 +119,14 @@ class MAMPC(Controller):
 
     def _planned_from(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
         """A pattern says which inputs move, so none may be outside its limits when it is chosen."""
+        if len(state.inputs) != self.rules.memory:
+            raise MampcError(
+                f"state: expected one of this controller, with {self.rules.memory} past inputs, "
+                f"received {len(state.inputs)}"
+            )
         if present is not None and not present.crossed:
             u = state.inputs[-1]
-            if ((u >= present.u_min[0]) & (u <= present.u_max[0])).all():
+            if ((u >= present.planned_min[0]) & (u <= present.planned_max[0])).all():
                 return state
             return self._brought_inside(state, present)
         for u, (low, high) in zip(state.inputs[-1].tolist(), self._u_range, strict=True):

@@ -15,7 +15,7 @@ from mampc.patterns import SAME, Admissible
 from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver
 
-MOST_KEPT = 4096  # patterns whose solvers are kept, some ten kilobytes each
+CACHE_BYTES = 64e6  # for recent patterns and their solvers
 ROUNDING = 1e-8  # input units: a smaller move may be none
 SMALLER = 1e-8  # input units: a move that falls short of its least size by no more is rounded up to it
 
@@ -62,11 +62,12 @@ class Incumbent:
 class Prepared:
     """What the programs on one pattern share: the optimum without limits, and a solver for the rest."""
 
-    def __init__(self, condensed: CondensedQP, pattern: BoolArray) -> None:
-        self._condensed, self._pattern = condensed, pattern
+    def __init__(self, condensed: CondensedQP, pattern: BoolArray, time_limit: float | None) -> None:
+        self._condensed, self._pattern, self._time_limit = condensed, pattern, time_limit
         self.chosen = np.flatnonzero(pattern)
         self._minus_inverse = -np.linalg.inv(condensed.H[self.chosen[:, None], self.chosen])
         self._rows = condensed.bounded_rows[:, self.chosen]
+        self.bytes = 4 * (self._rows.nbytes + 20 * len(self._rows))  # with its solver, about
         self._solver: tuple[Restriction, DaqpSolver] | None = None
 
     def unlimited(self, f_moves: Array, lower: Array, upper: Array, sizes: Array | None) -> Array | None:
@@ -81,7 +82,7 @@ class Prepared:
         """The restricted program and its solver, set up when first wanted."""
         if self._solver is None:
             restriction = self._condensed.restricted(self._pattern)
-            self._solver = restriction, DaqpSolver(restriction.program)
+            self._solver = restriction, DaqpSolver(restriction.program, time_limit=self._time_limit)
         return self._solver
 
 
@@ -96,6 +97,7 @@ class PatternSolver:
         limits_expected: whether plans mostly run into limits, so that it does not pay to try the optimum without
             them first. (Where they do not, it spares setting up a solver for every new pattern.)
         most_programs: that a search over signs may take.
+        time_limit: seconds that one program may take; None for no limit.
     """
 
     def __init__(
@@ -105,10 +107,12 @@ class PatternSolver:
         *,
         limits_expected: bool = False,
         most_programs: float = np.inf,
+        time_limit: float | None = None,
     ) -> None:
-        self.condensed, self.admissible = condensed, admissible
+        self.condensed, self.admissible, self._time_limit = condensed, admissible, time_limit
         self._limits_expected, self._most_programs = limits_expected, most_programs
         self._kept: OrderedDict[bytes, Prepared] = OrderedDict()
+        self._kept_bytes = 0
 
     def solve(
         self, instance: Instance, pattern: BoolArray, cutoff: float = np.inf, deadline: float = np.inf
@@ -208,9 +212,10 @@ class PatternSolver:
         key = pattern.tobytes()
         entry = self._kept.get(key)
         if entry is None:
-            entry = self._kept[key] = Prepared(self.condensed, pattern.copy())
-            if len(self._kept) > MOST_KEPT:
-                self._kept.popitem(last=False)
+            entry = self._kept[key] = Prepared(self.condensed, pattern.copy(), self._time_limit)
+            self._kept_bytes += entry.bytes
+            while self._kept_bytes > CACHE_BYTES and len(self._kept) > 1:
+                self._kept_bytes -= self._kept.popitem(last=False)[1].bytes
         else:
             self._kept.move_to_end(key)
         return entry

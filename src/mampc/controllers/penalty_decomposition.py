@@ -42,6 +42,7 @@ class PenaltyDecomposition(Heuristic):
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         as_number("penalty", self.penalty, 0.0, exclusive=True)
         as_number("growth", self.growth, 1.0, exclusive=True)
         as_number("tolerance", self.tolerance, 0.0, exclusive=True)

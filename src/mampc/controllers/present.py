@@ -25,6 +25,8 @@ class PresentLimits:
         du_max: shape (nc, m).
         y_min, y_max: at i = 1..np, shape (np, l).
         crossed: whether some u_min is above its u_max, so that no input can keep both.
+        planned_min, planned_max: what plans keep, shape (nc, m): `u_min` and `u_max`, and no limits for inputs that
+            somebody else holds beyond them.
 
     Raises:
         MampcError: the wrong shape, or limits of signals for which the problem has none.
@@ -50,13 +52,19 @@ class PresentLimits:
         self.du_max = np.clip(told("du_max", n_c), 0.0, usual.du_max)
         self.y_min, self.y_max = told("y_min", n_p), told("y_max", n_p)
         self.crossed = bool((self.u_min > self.u_max).any())
+        self.planned_min, self.planned_max = self.u_min, self.u_max
+
+    def release(self, manual: BoolArray) -> None:
+        """Have plans leave inputs in manual, shape (m,), where they are, though they are outside their limits."""
+        self.planned_min = np.where(manual, -LARGEST, self.u_min)
+        self.planned_max = np.where(manual, LARGEST, self.u_max)
 
     def applied_to(self, instance: Instance, condensed: CondensedQP) -> Instance:
         """The sample with these limits for bounds."""
         v, n_simple = condensed.n_violations, condensed.program.n_simple
         m, l = condensed.problem.model.n_inputs, condensed.problem.model.n_outputs
         lower, upper, u = instance.lower.copy(), instance.upper.copy(), instance.u_previous
-        low, high = self.u_min.ravel(), self.u_max.ravel()
+        low, high = self.planned_min.ravel(), self.planned_max.ravel()
         if condensed.moves_bounded:
             upper[v:n_simple] = self.du_max.ravel()
             lower[v:n_simple] = -upper[v:n_simple]
@@ -74,10 +82,10 @@ class PresentLimits:
             bound_of_move[:m] = np.arange(v, n_simple)
         present = PresentBounds(
             np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), condensed.bounded_rows,
-            self.u_min - u, self.u_max - u, bound_of_move,
+            self.planned_min - u, self.planned_max - u, bound_of_move,
         )  # fmt: skip
         return Instance(
-            instance.data, instance.parts, instance.parameter, instance.u_previous, instance.manual, present
+            instance.data, instance.parts, instance.parameter, instance.u_previous, instance.rest, present
         )
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mampc.errors import MampcError
@@ -33,9 +34,11 @@ class ResultFolder:
             if path.exists() and not path.is_dir():
                 raise MampcError(f"--out: expected a directory, received the file {path}")
             path.mkdir(parents=True, exist_ok=True)
-            for left in path.rglob(f".*{PARTIAL}*"):
-                if left.is_file() and not _running(left.name.rpartition(PARTIAL)[2]):
-                    left.unlink(missing_ok=True)
+            for name in {*self._of_last_run(), MANIFEST, last}:
+                place = path / name
+                for left in place.parent.glob(f".{glob.escape(place.name)}{PARTIAL}*"):
+                    if not _running(left.name.rpartition(PARTIAL)[2]):
+                        left.unlink(missing_ok=True)
             with written_whole(path / ".mampc-writable") as probe:
                 probe.write_text("")
             (path / ".mampc-writable").unlink()
@@ -46,7 +49,8 @@ class ResultFolder:
         """Remove what the last run left here, the file that vouches for the others first."""
         (self.path / self._last).unlink(missing_ok=True)
         for name in self._of_last_run():
-            (self.path / name).unlink(missing_ok=True)
+            with suppress(NotADirectoryError):
+                (self.path / name).unlink(missing_ok=True)
         self._names = []
 
     def place(self, name: str) -> Path:
@@ -56,7 +60,10 @@ class ResultFolder:
             with written_whole(self.path / MANIFEST) as unfinished:
                 unfinished.write_text("\n".join(self._names) + "\n", encoding="utf-8")
         place = self.path / name
-        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise MampcError(f"{place}: expected a file that can be written, received: {error}") from None
         return place
 
     @contextmanager
@@ -76,10 +83,11 @@ class ResultFolder:
 
 
 def _running(process: str) -> bool:
+    """Whether there may be a process of this number; what is no number belongs to somebody else."""
     try:
         os.kill(int(process), 0)
-    except (ValueError, ProcessLookupError, OverflowError):
+    except (ProcessLookupError, OverflowError):
         return False
-    except OSError:
+    except (ValueError, OSError):
         return True
     return True

@@ -31,6 +31,8 @@ def replay_trajectory(
     prepared = prepare(study, on_stage, StateSpace.load(beside) if beside.is_file() else None)
     regulator = regulator_of(study, prepared.model, controller)
     recording = Recording.from_csv(path, prepared.plant.names)
+    if len(recording.t) != study.steps:
+        raise MampcError(f"{path}: expected the study's {study.steps} samples, received {len(recording.t)}")
     on_stage(f"replaying {len(recording.t)} samples")
     state = initial_state(study, prepared, scenario, regulator)
     difference = replay(regulator, state, recording, preview=study.reference.preview, tolerance=tolerance)
