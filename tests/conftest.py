@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 
 from mampc.qp import UNBOUNDED, QPStatus
 from mampc.qp_daqp import DaqpSolver
@@ -12,10 +12,16 @@ from mampc.qp_daqp import DaqpSolver
 # For tests/test_fuzz.py alone; other tests keep the settings that they state.
 settings.register_profile(
     "short", max_examples=100, stateful_step_count=20, deadline=None, derandomize=True,
+    phases=[Phase.explicit, Phase.generate],  # shrinking takes many minutes; `make fuzz` does it
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 settings.register_profile(
-    "long", settings.get_profile("short"), max_examples=3000, derandomize=False, print_blob=True
+    "long",
+    settings.get_profile("short"),
+    max_examples=3000,
+    derandomize=False,
+    print_blob=True,
+    phases=list(Phase),
 )
 
 TOLERANCE = 1e-8  # relative to the sizes of the data

@@ -52,12 +52,13 @@ def is_usable(values):
     return np.abs(np.nan_to_num(read(values), nan=np.inf)) < LARGEST
 
 
-def believable(applied, limits):
-    """Which applied inputs some actuator may have reached."""
+def believable(applied, decided, limits):
+    """Which applied inputs count: those that some actuator may have reached, and that are not the decided ones."""
     apart = limits.u_max - limits.u_min
     beyond = np.where(apart > 0, 100.0 * apart, LARGEST)
-    near = (applied > limits.u_min - beyond) & (applied < limits.u_max + beyond)
-    return near & is_usable(applied)
+    near = (applied > limits.u_min - beyond) & (applied < limits.u_max + beyond) & is_usable(applied)
+    applied = np.where(near, applied, decided)
+    return np.abs(applied - decided) > np.where(np.isfinite(apart), 1e-3 * apart, 1e-6)
 
 
 def same_to_the_bit(a, b):
@@ -193,7 +194,7 @@ class FaultyLoop(RuleBasedStateMachine):
         if applied is not None:
             before = self.history[-2] if len(self.history) > 1 else decided
             u_applied, told = fuzzing.spoilt(decided, applied, before)
-            self.history[-1] = np.where(believable(told, self.problem.limits), told, decided)
+            self.history[-1] = np.where(believable(told, decided, self.problem.limits), told, decided)
         arguments = {
             "u_applied": u_applied, "measured_disturbance": v, "limits": self.present, "manual": self.manual
         }  # fmt: skip

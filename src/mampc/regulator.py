@@ -19,6 +19,7 @@ from mampc.qp_daqp import active_flags
 from mampc.regulator_state import RegulatorState
 from mampc.sensors import SensorChecks
 
+NEAR = 1e-3  # times the range of an input: position feedback is no more exact
 ABSURD = 100.0  # times the range of an input: no actuator is that far outside
 
 
@@ -31,6 +32,9 @@ class Regulator:
         sensors: when a measurement is believed; default `SensorChecks()`.
         max_blind_steps: samples in a row that inputs are still planned, on predictions, though no output at
             all is believed; from then on they are held until one is. 0 holds at once.
+        applied_tolerance: an applied input this near to the decided one is the decided one: position feedback
+            is never exact. In input units, a scalar or (m,); default a thousandth of the input's range, or
+            1e-6 where that is not finite.
 
     Raises:
         MampcError: arguments of other types, or an estimator of a model of other dimensions.
@@ -43,6 +47,7 @@ class Regulator:
         *,
         sensors: SensorChecks | None = None,
         max_blind_steps: int = 0,
+        applied_tolerance: Any = None,
     ) -> None:
         if not isinstance(controller, Controller):
             raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
@@ -59,6 +64,11 @@ class Regulator:
         self._v_shape = (model.n_disturbances,)
         limits = controller.problem.limits
         apart = limits.u_max - limits.u_min
+        self._applied_tolerance = np.where(np.isfinite(apart), NEAR * apart, 1e-6)
+        if applied_tolerance is not None:
+            self._applied_tolerance = as_vector("applied_tolerance", applied_tolerance, model.n_inputs)
+        if (self._applied_tolerance < 0).any():
+            raise MampcError(f"applied_tolerance: expected at least 0, received {applied_tolerance!r}")
         beyond = np.where(apart > 0, ABSURD * apart, LARGEST)
         self._u_low = np.maximum(limits.u_min - beyond, -LARGEST)
         self._u_high = np.minimum(limits.u_max + beyond, LARGEST)
@@ -124,8 +134,10 @@ class Regulator:
                 inputs are held (see `max_blind_steps`).
             reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
             u_applied: what the plant really got since the last step, shape (m,), if not what was decided:
-                a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided, and so does
-                a value a hundred times further outside its limits than these are apart.
+                a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided, and so do
+                a value within `applied_tolerance` and one a hundred times further outside its limits than these
+                are apart. Tell nothing (not-a-number) while an actuator is only on its way: what is told is
+                where plans start from, and a move not made is not counted.
             measured_disturbance: now, shape (d,), in engineering units; predicted to stay as it is.
                 Left out or not usable, the last one holds on.
             limits, manual: see `Controller.step`. Tell `u_applied` while an input is in manual; when it is
@@ -139,10 +151,10 @@ class Regulator:
         memory, v_last = state.controller, state.measured_disturbance
         if u_applied is not None:
             memory = self._applied(memory, u_applied)
+        u_previous = memory.inputs[-1]
         v = v_last
         if measured_disturbance is not None:
             v = _where_usable(as_shaped("measured_disturbance", measured_disturbance, self._v_shape), v_last)
-        u_previous = memory.inputs[-1]
         estimator, last = self.estimator, state.estimate
         estimate = estimator.predict(last, u_previous, v_last)
         estimated = (estimate.x, estimate.output_disturbance, estimate.input_disturbance)
@@ -176,11 +188,14 @@ class Regulator:
         )
 
     def _applied(self, memory: ControllerState, u_applied: Any) -> ControllerState:
-        """The memory with the latest inputs put right; not-usable numbers change nothing."""
+        """The memory with the latest inputs put right, where what is told differs and can be believed."""
         decided = memory.inputs[-1]
         told = as_shaped("u_applied", u_applied, decided.shape)
-        u = np.where((told > self._u_low) & (told < self._u_high), told, decided)
-        return replace(memory, inputs=np.concatenate([memory.inputs[:-1], u[None]]))
+        known = (told > self._u_low) & (told < self._u_high)
+        known[known] &= (np.abs(told - decided) > self._applied_tolerance)[known]
+        return replace(
+            memory, inputs=np.concatenate([memory.inputs[:-1], np.where(known, told, decided)[None]])
+        )
 
 
 def _where_usable(told: Array, otherwise: Array) -> Array:
