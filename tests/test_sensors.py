@@ -139,6 +139,49 @@ def test_a_stuck_sensor_does_not_drive_the_plant_away():
     assert np.abs(outputs[-1] - reference).max() < 0.5
 
 
+@pytest.mark.parametrize("value", [0.0, 20.0, 60.0, 1e11])
+def test_a_broken_wire_is_found_and_what_it_did_to_the_estimate_is_undone(value):
+    """y1 falls to a constant and stays: a jump that lasts is believed at first, a stuck sensor is not."""
+    decisions, outputs, reference = plant_loop(
+        tank_regulator(), 260, lambda k, y: np.array([value, y[1]]) if k >= 60 else y
+    )
+    told = [d.ignored_outputs.get("y1") for d in decisions]
+    assert told[60:62] == [Fault.JUMP] * 2
+    assert all(told[75:])
+    assert np.abs(outputs[-60:] - reference)[:, 0].max() < 1.0
+    assert np.abs(outputs[-60:] - reference)[:, 1].max() < 0.5
+
+
+class Overflowing:
+    """A tank (first order, gain 1) whose level cannot exceed 55."""
+
+    names = mampc.Names(("u",), ("y",), ("x",))
+    u_op = (40.0,)
+
+    def derivative(self, x, u):
+        return np.where((x >= 55.0) & (u > x), 0.0, (u - x) / 50.0)
+
+    def output(self, x, u):
+        return np.minimum(x, 55.0)
+
+    def steady_state(self, u=None):
+        return np.minimum(np.atleast_1d(self.u_op if u is None else u), 55.0)
+
+
+@pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=1.0)])
+def test_a_plant_at_a_hard_stop_looks_stuck_and_is_controlled_again_in_the_end(rules):
+    model = mampc.StateSpace([[np.exp(-0.2)]], [[1 - np.exp(-0.2)]], [[1.0]], None, 10.0, [40.0], [40.0])
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=20, control_horizon=3, limits=mampc.Limits(u_min=0.0, u_max=100.0)
+    )
+    regulator = mampc.Regulator(mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules))
+    reference = mampc.steps(600, [45.0], [(50, [60.0]), (200, [40.0])])
+    run = mampc.simulate(Overflowing(), regulator, reference, progress=False)
+    assert any(d.ignored_outputs.get("y1") is Fault.STUCK for d in run.decisions)
+    assert run.y[150:200].max() >= 54.9
+    assert abs(run.y[-1, 0] - 40.0) < 0.5
+
+
 def test_values_outside_the_range_of_a_sensor_are_ignored():
     regulator = tank_regulator(sensors=mampc.SensorChecks(y_low=0.0, y_high=[40.0, 60.0]))
     state, y = regulator.initial_state(), regulator.controller.problem.model.y_op

@@ -17,7 +17,7 @@ from mampc.lti import StateSpace
 from mampc.problem import Limits
 from mampc.qp_daqp import active_flags
 from mampc.regulator_state import RegulatorState
-from mampc.sensors import SensorChecks
+from mampc.sensors import SensorChecks, newly_stuck
 
 NEAR = 1e-3  # times the range of an input: position feedback is no more exact
 ABSURD = 100.0  # times the range of an input: no actuator is that far outside
@@ -160,15 +160,22 @@ class Regulator:
         estimated = (estimate.x, estimate.output_disturbance, estimate.input_disturbance)
         if not all(is_usable(part) for part in estimated):
             # It ran away without measurements: start again.
-            last = estimate = estimator.initial(u_previous, y if is_usable(y) else None, v_last)
+            last = estimate = estimator.initial(u_previous, None, v_last)
         # Measurements show v at once and u later.
         innovation = estimator.innovation(estimate, u_previous, y, v)
         movement = estimator.model.C @ (estimate.x - last.x)
-        believed, ignored, sensors = self._sensors.check(state.sensors, y, innovation, movement)
+        believed, ignored, sensors = self._sensors.check(
+            state.sensors, y, innovation, movement, last.output_disturbance
+        )
         if not ignored:
             estimate = estimator.corrected(estimate, innovation)
-        elif believed.any():
-            estimate = estimator.corrected(estimate, innovation, believed)
+        else:
+            stuck = newly_stuck(state.sensors, sensors)
+            if stuck.any():
+                disturbance = np.where(stuck, sensors.disturbance, estimate.output_disturbance)
+                estimate = replace(estimate, output_disturbance=disturbance)
+            if believed.any():
+                estimate = estimator.corrected(estimate, innovation, believed)
         blind = sensors.blind > self.max_blind_steps
         decision = self.controller.step(
             memory,

@@ -5,9 +5,11 @@ Every test is made against what the model predicts, since only that tells a faul
 - missing: not a number, infinite, masked, or beyond any engineering unit;
 - out of range: outside what the sensor can show;
 - jump: further from its prediction than `largest_jump`. Where it stays there (`confirm` samples within
-  `largest_jump` of one another), it is the plant that jumped, and it is believed;
+  `largest_jump` of one another), it is the plant that jumped, and it is believed, unless it is a thousand times as
+  far;
 - stuck: to the last bit the same for `stuck_after` samples, while the model moved that output by more than a
-  fifth of `largest_jump`. It is believed again once it changes.
+  fifth of `largest_jump`. It is believed again once it changes; or, where no other output is believed either, after
+  ten times as long, since a plant at a hard stop (a tank that overflows) looks the same.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from mampc.problem import TrackingProblem
 from mampc.sentences import Sentence
 
 OF_REACH = 0.1  # default jump, as a share of what the inputs' whole range does to an output
+GIVE_UP = 10  # times `stuck_after` samples blind: then a stuck sensor is believed again
+ABSURD = 1000.0  # times the largest jump: never believed, however long it stays
 STUCK = 0.2  # predicted movement, as a share of the largest jump, that a working sensor shows
 
 
@@ -77,6 +81,7 @@ class SensorState:
         repeats: how many samples it has been the same.
         moved: how far the model moved the output meanwhile; `LARGEST` once it counts as stuck.
         doubted: how many samples in a row jumped to about the same place.
+        disturbance: estimated at the output when its present number first came.
         blind: samples in a row without any output believed.
     """
 
@@ -84,6 +89,7 @@ class SensorState:
     repeats: Array
     moved: Array
     doubted: Array
+    disturbance: Array
     blind: int = 0
 
 
@@ -113,14 +119,14 @@ class Sensors:
         self._stuck_after = np.inf if checks.stuck_after is None else checks.stuck_after
         self._names = problem.model.names.outputs
         self._all, self._none = np.ones(l, dtype=bool), np.zeros(l)
-        self._start = SensorState(self._none, self._none, self._none, self._none)
+        self._start = SensorState(*(self._none,) * 5)
 
     def initial(self) -> SensorState:
         """Before the first sample."""
         return self._start
 
     def check(
-        self, state: SensorState, y: Array, innovation: Array, movement: Array
+        self, state: SensorState, y: Array, innovation: Array, movement: Array, disturbance: Array
     ) -> tuple[BoolArray, dict[str, Fault], SensorState]:
         """Judge one sample.
 
@@ -129,13 +135,14 @@ class Sensors:
             y: measurements, shape (l,), finite or not.
             innovation: measured less predicted outputs, shape (l,).
             movement: how far the model moved the outputs since the last sample, shape (l,).
+            disturbance: estimated at the outputs before this sample, shape (l,).
 
         Returns:
             Which outputs are believed, shape (l,); the fault of every other by its name; the next state.
         """
         fine = (np.abs(innovation) <= self._jump) & (y != state.y) & (y >= self._low) & (y <= self._high)
         if fine.all():  # the everyday case, at once
-            return self._all, {}, SensorState(y.copy(), self._none, self._none, self._none)
+            return self._all, {}, SensorState(y.copy(), self._none, self._none, self._none, disturbance)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))
         came = ~(missing | out)
@@ -144,17 +151,21 @@ class Sensors:
         moved = np.where(came & ~same, 0.0, state.moved + movement)
         moving = np.abs(moved) > np.minimum(STUCK * self._jump, LARGEST / 2)
         stuck = same & (repeats >= self._stuck_after) & moving
+        if state.blind >= GIVE_UP * self._stuck_after:
+            repeats[stuck], moved[stuck], stuck = 0.0, 0.0, np.zeros_like(stuck)
         moved[stuck] = LARGEST
         jumped = came & ~stuck & (np.abs(innovation) > self._jump)
         doubted = np.where(came, 0.0, state.doubted)
         near = jumped & (np.abs(y - state.y) <= self._jump)
         doubted[jumped] = 1.0
-        doubted[near] = state.doubted[near] + 1.0
+        near &= np.abs(innovation) < ABSURD * self._jump
+        doubted[near] += state.doubted[near]
         jump = jumped & (doubted < self._confirm)
         believed = came & ~stuck & ~jump
         after = SensorState(
-            np.where(came, y, state.y), repeats, moved, doubted, 0 if believed.any() else state.blind + 1
-        )
+            np.where(came, y, state.y), repeats, moved, doubted,
+            np.where(came & ~same, disturbance, state.disturbance), 0 if believed.any() else state.blind + 1,
+        )  # fmt: skip
         faults = {}
         for fault, affected in (
             (Fault.MISSING, missing), (Fault.OUT_OF_RANGE, out), (Fault.STUCK, stuck), (Fault.JUMP, jump),
@@ -163,10 +174,16 @@ class Sensors:
         return believed, faults, after
 
 
+def newly_stuck(before: SensorState, after: SensorState) -> BoolArray:
+    """The outputs found stuck at this sample, shape (l,): what was estimated since they are is wrong."""
+    found: BoolArray = (after.moved >= LARGEST) & (before.moved < LARGEST)
+    return found
+
+
 def _reach(problem: TrackingProblem) -> Array:
     """How far the whole range of the inputs moves each output at rest, shape (l,)."""
     model, limits = problem.model, problem.limits
     gain = np.abs(static_response(model)[:, : model.n_inputs])
     ranges = np.broadcast_to(limits.u_max - limits.u_min, gain.shape)
-    reach: Array = np.where(gain > 0, gain * np.where(gain > 0, ranges, 0.0), 0.0).sum(axis=1)
+    reach: Array = (gain * np.where(gain > 0, ranges, 0.0)).sum(axis=1)
     return np.where(reach > 0, reach, np.inf)
