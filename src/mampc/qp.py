@@ -65,11 +65,14 @@ class QuadraticProgram:
             )
         if not (np.isfinite(self.H).all() and np.isfinite(self.A).all()):
             raise MampcError("QuadraticProgram: expected finite numbers in H and A, received others")
-        eigenvalues = np.linalg.eigvalsh(self.H) if n else np.ones(1)
+        # Of unit diagonal, so that the units of the variables do not matter.
+        size = np.sqrt(np.maximum(np.diag(self.H), 1e-300))
+        eigenvalues = np.linalg.eigvalsh(self.H / np.outer(size, size)) if n else np.ones(1)
         if not eigenvalues[0] > 1e-13 * eigenvalues[-1]:
             raise MampcError(
                 "QuadraticProgram: expected a positive definite Hessian, received smallest and largest "
-                f"eigenvalues {eigenvalues[0]:.3g} and {eigenvalues[-1]:.3g}; give every move a weight"
+                f"eigenvalues {eigenvalues[0]:.3g} and {eigenvalues[-1]:.3g} (of unit diagonal); give every move a "
+                "weight"
             )
 
     @property

@@ -23,6 +23,7 @@ _STATUS = {
     -7: QPStatus.TIME_LIMIT,
 }
 ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
+LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
 
 
@@ -97,8 +98,31 @@ class DaqpSolver:
         z, _, flag, info = model.solve()
         if flag <= 0:
             self._local.model = None
-            return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
+            status = _STATUS.get(flag, QPStatus.FAILED)
+            scale = self._scale(f)
+            if scale > 1 and status is not QPStatus.TIME_LIMIT:
+                return self._solve_scaled(f, lower, upper, scale)
+            return QPSolution(None, None, status, info["iterations"])
         return QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
+
+    def _scale(self, f: Array) -> float:
+        """A power of two by which to divide z, where its numbers are too large for an absolute tolerance, else 1.
+
+        daqp keeps bounds to within `primal_tol` in the coordinates in which H is the unit matrix; an optimum
+        that is too long there (outputs in Pa and inputs in kg/s, say) looks infeasible to it.
+        """
+        length = float(np.max(np.abs(f) / np.sqrt(np.diag(self.program.H)), initial=0.0))
+        return float(2.0 ** np.ceil(np.log2(length / LONGEST))) if length > LONGEST else 1.0
+
+    def _solve_scaled(self, f: Array, lower: Array, upper: Array, scale: float) -> QPSolution:
+        """The same program in z / scale, which has the same H and A."""
+        model = self._fresh_model()
+        if model.update(f=_own(f / scale), blower=_own(lower / scale), bupper=_own(upper / scale)) < 0:
+            return _BAD_DATA
+        z, _, flag, info = model.solve()
+        if flag <= 0:
+            return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
+        return QPSolution(z * scale, info["lam"] * scale, QPStatus.OPTIMAL, info["iterations"])
 
     def start(self, active: Array | None = None) -> None:
         """Begin anew: the next solve starts from these active bounds, as `active_bounds` gives them, default none."""

@@ -1,0 +1,64 @@
+"""Units are the user's: kg/s and Pa, or percent and bar, lead to the same decisions."""
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import random_model
+
+METHODS = {
+    "mpc": None,
+    "exact": {"method": "exact"},
+    "alternating": {"method": "alternating", "polish": True},
+}
+
+RULES = mampc.MoveRules(price=0.02, max_moves=4, sparsity_horizon=2)  # a price is in units of the cost
+
+
+def scaled(model, u, y):
+    """The model with inputs in units that make their numbers u times as large, and outputs y times."""
+    return mampc.StateSpace(
+        model.A, model.B / u, model.C * y, model.D * y / u, model.dt, model.u_op * u, model.y_op * y
+    )
+
+
+def run(model, u, y, settings, weights):
+    limits = mampc.Limits(
+        u_min=(model.u_op - 0.8) * u,
+        u_max=(model.u_op + 0.8) * u,
+        du_max=0.5 * u,
+        y_max=(model.y_op + 1.2) * y,
+    )
+    problem = mampc.TrackingProblem(
+        scaled(model, u, y), prediction_horizon=15, control_horizon=4, limits=limits, **weights
+    )
+    controller = mampc.MPC(problem)
+    if settings is not None:
+        controller = mampc.MAMPC(problem, RULES, **settings)
+    high = model.y_op + np.array([1.0, -0.5])
+    reference = mampc.steps(60, model.y_op * y, [(5, high * y), (30, model.y_op * y)])
+    return mampc.simulate(problem.model, mampc.Regulator(controller), reference, progress=False)
+
+
+@pytest.mark.parametrize("name", ["mpc", "exact"])
+@pytest.mark.parametrize(("u", "y"), [(1e-3, 1.0), (1.0, 1e5), (1e4, 1e-3), (1e-3, 1e5)])
+def test_units_change_numbers_and_not_decisions(name, u, y):
+    """With weights in the same units."""
+    model = random_model(4, n=3, m=2, l=2, radius=0.8)
+    usual = run(model, 1.0, 1.0, METHODS[name], {"output_weight": 1.0, "move_weight": 0.1})
+    weights = {"output_weight": 1.0 / y**2, "move_weight": 0.1 / u**2}
+    other = run(model, u, y, METHODS[name], weights)
+    assert other.statuses == usual.statuses
+    np.testing.assert_allclose(other.u / u, usual.u, atol=1e-5)
+    np.testing.assert_allclose(other.y / y, usual.y, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(("u", "y"), [(1e-3, 1e3), (1e-3, 1e5), (1e-4, 1e6), (1.0, 1e8)])
+def test_with_the_default_weights_too_units_far_apart_are_controlled(name, u, y):
+    """Tracking outweighs moves by many orders of magnitude then; limits are kept all the same."""
+    model = random_model(4, n=3, m=2, l=2, radius=0.8)
+    outcome = run(model, u, y, METHODS[name], {})
+    assert set(outcome.statuses) <= {"optimal", "feasible", "warm_up"}
+    assert (np.abs(outcome.u - model.u_op * u) <= 0.8 * u * (1 + 1e-9)).all()
+    assert (np.abs(outcome.y[-1] - outcome.r[-1]) < 0.05 * y).all()
