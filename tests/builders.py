@@ -79,6 +79,11 @@ def violation_scale(problem):
     return np.sqrt(np.maximum(np.abs(np.diag(problem.output_weight)), moving))
 
 
+def fading(n_p):
+    """rho_1 .. rho_np: how much of the violation each sample may have."""
+    return 1 - 0.5 * np.arange(n_p) / max(n_p - 1, 1)
+
+
 def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, output_disturbance=0.0):
     """The cost of planned inputs as `TrackingProblem` states it, by simulating the model."""
     n_p, limits = problem.prediction_horizon, problem.limits
@@ -86,8 +91,8 @@ def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, outp
     error = np.broadcast_to(reference, y.shape) - y
     changes = np.diff(np.vstack([u_previous, plan]), axis=0)
     weighed = changes if problem.weigh_first_move else changes[1:]
-    excess = np.maximum(0.0, np.maximum(y - limits.y_max, limits.y_min - y))[1:].max(axis=0)
-    scaled = violation_scale(problem) * excess
+    excess = np.maximum(0.0, np.maximum(y - limits.y_max, limits.y_min - y))[1:]
+    scaled = violation_scale(problem) * (excess / fading(n_p)[:, None]).max(axis=0)
     return (
         np.einsum("ia,ab,ib", error, problem.output_weight, error)
         + np.einsum("ja,ab,jb", weighed, problem.move_weight, weighed)

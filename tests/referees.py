@@ -8,7 +8,7 @@ import numpy as np
 import pyscipopt
 from scipy import sparse
 
-from builders import cost_of, predicted, violation_scale
+from builders import cost_of, fading, predicted, violation_scale
 
 TINY = 1e-9  # changes below are rounding
 
@@ -99,7 +99,7 @@ def program_of(problem, x, u_previous, reference):
     H[:l, :l] = w * np.eye(l)
     H[l:, l:] = 2 * (theta.T @ Q @ theta + R)
     f = np.concatenate([np.full(l, w), -2 * theta.T @ Q @ error])
-    none, violation = np.zeros((n, l)), np.tile(np.diag(1 / scale), (n_p, 1))
+    none, violation = np.zeros((n, l)), np.kron(fading(n_p)[:, None], np.diag(1 / scale))
     rows = np.block([
         [none, to_inputs], [none, -to_inputs], [none, np.eye(n)], [none, -np.eye(n)],
         [-violation, theta[l:]], [-violation, -theta[l:]], [-np.eye(l), np.zeros((l, n))],

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mampc
-from builders import identified_tank, predicted, random_model, tank_problem, violation_scale
+from builders import fading, identified_tank, predicted, random_model, tank_problem, violation_scale
 from mampc import Remark, Status
 
 METHODS = ["mpc", *mampc.METHODS]
@@ -58,8 +58,9 @@ def best_by_cvxpy(problem, limits, x, u_previous, reference, pattern):
     scaled = cp.multiply(violation_scale(problem), e)
     cost += problem.output_limit_weight * (cp.sum(scaled) + cp.sum_squares(scaled) / 2)
     constraints = [u >= limits.u_min, u <= limits.u_max, cp.abs(changes) <= limits.du_max]
-    constraints += [outputs[i + 1] <= limits.y_max[i] + e for i in range(n_p)]
-    constraints += [outputs[i + 1] >= limits.y_min[i] - e for i in range(n_p)]
+    rho = fading(n_p)
+    constraints += [outputs[i + 1] <= limits.y_max[i] + rho[i] * e for i in range(n_p)]
+    constraints += [outputs[i + 1] >= limits.y_min[i] - rho[i] * e for i in range(n_p)]
     constraints += [changes[~pattern] == 0] if (~pattern).any() else []
     problem_ = cp.Problem(cp.Minimize(cost), constraints)
     problem_.solve(solver=cp.CLARABEL)
@@ -173,6 +174,28 @@ def test_a_plant_outside_its_output_limits_is_brought_back_and_the_violation_is_
         x = model.A @ x + model.B @ (decision.u - model.u_op)
     assert told[0][0] > 0.5
     np.testing.assert_allclose(told[-1], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("low", "high"), [([40, 35], [45, 40]), ([36, 31], [41, 36])])
+@pytest.mark.parametrize(
+    "rules",
+    [
+        {"sparsity_horizon": 4, "max_moves": 3},
+        {"sparsity_horizon": 4, "max_moves": 2},
+        {"sparsity_horizon": 8, "max_moves": 3},
+    ],
+)
+def test_a_budget_does_not_keep_outputs_outside_their_limits(low, high, rules):
+    """On the way back one output passes through more violation for a while."""
+    limits = mampc.Limits(u_min=0.0, u_max=100.0, y_min=low, y_max=high)
+    controller = mampc.MAMPC(tank_problem(identified_tank(), limits=limits), mampc.MoveRules(**rules))
+    middle = (np.array(low) + high) / 2
+    run = mampc.simulate(
+        mampc.plants.QuadrupleTank(), mampc.Regulator(controller), middle, steps=200, progress=False
+    )
+    assert run.decisions[0].violations.max() > 1.0
+    np.testing.assert_allclose(run.y[-1], middle, atol=0.3)
+    np.testing.assert_array_equal(run.decisions[-1].violations, 0.0)
 
 
 # Actuators and manual mode

@@ -13,6 +13,7 @@ from scipy.linalg import solve_discrete_are
 import mampc
 from builders import (
     cost_of,
+    fading,
     predicted,
     random_model,
     random_weight,
@@ -88,7 +89,9 @@ def by_cvxpy(problem, x, u_previous, reference, input_disturbance, output_distur
         X[1:] == X[:-1] @ model.A.T + V[:-1] @ model.B.T,
         *within(U, limits.u_min, limits.u_max),
         *within(dU, -limits.du_max, limits.du_max),
-        *within(Y[1:], limits.y_min, limits.y_max, np.ones((n_p, 1)) @ cp.reshape(e, (1, e.size), order="C")),
+        *within(
+            Y[1:], limits.y_min, limits.y_max, fading(n_p)[:, None] @ cp.reshape(e, (1, e.size), order="C")
+        ),
     ]
     scaled = cp.multiply(violation_scale(problem), e)
     cost += problem.output_limit_weight * (cp.sum(scaled) + cp.sum_squares(scaled) / 2)

@@ -6,8 +6,7 @@ With the step response S_i = D + sum_{k<i} C A^k B of the model, the predicted o
     free_i = y_op + C A^i x + S_i (u_prev + d_u - u_op) + S^v_i (v - v_op) + d_y      (no more moves)
 
 with constant disturbances: d_u at the inputs, d_y at the outputs, and measured ones v with their own step
-response S^v. With `theta` the lower
-block-triangular matrix of step responses and error = r - free
+response S^v. With `theta` the lower block-triangular matrix of step responses and error = r - free
 
     cost = |error - theta d|^2_Q + |d|^2_R = 1/2 d' H d + f' d + |error|^2_Q
     H = 2 (theta' Q theta + R),   f = -2 theta' Q error,   d = (du_0, ..., du_{nc-1}).
@@ -31,7 +30,9 @@ from mampc.errors import MampcError
 from mampc.instance import Indices, Instance, Parts, PatternOptimum
 from mampc.problem import TrackingProblem
 from mampc.qp import UNBOUNDED, QuadraticProgram
+from mampc.tail import square_root, tail
 
+FADED = 0.5  # of a violation at the first sample: what it may be at the last at the same penalty
 LARGEST_RESPONSE = 1e100  # per unit of state or input; its square is still a number
 
 
@@ -95,7 +96,7 @@ class CondensedQP:
         for j in range(n_c):
             self.theta[j * l :, j * m : (j + 1) * m] = step[: n_p + 1 - j, :, :m].reshape(-1, m)
 
-        root = np.kron(np.eye(n_p + 1), _square_root(problem.output_weight))
+        root = np.kron(np.eye(n_p + 1), square_root(problem.output_weight))
         self.weighted_theta = root @ self.theta
         self.R = np.kron(np.eye(n_c), problem.move_weight)
         if not problem.weigh_first_move:
@@ -115,7 +116,7 @@ class CondensedQP:
 
         error = root @ error
         if problem.tail_horizon > 0:
-            tail_error, tail_theta = self._tail(np.array(powers), free.shape[1])
+            tail_error, tail_theta = tail(problem, np.array(powers), free.shape[1])
             error, self.weighted_theta = (
                 np.vstack([error, tail_error]), np.vstack([self.weighted_theta, tail_theta]),
             )  # fmt: skip
@@ -126,7 +127,7 @@ class CondensedQP:
         f[: self.n_violations, self._one_at] = problem.output_limit_weight
         f[self.n_violations :] = -2 * self.weighted_theta.T @ error
         self._affine = {"error": error, "f": f, "lower": lower, "upper": upper}
-        self._u_previous_map, self._root_R = u_previous, _square_root(self.R)
+        self._u_previous_map, self._root_R = u_previous, square_root(self.R)
         self._preview_map, self.parts = _stacked(
             **self._optimum_maps(np.ones(self.n_moves, dtype=bool)), f=f, f_moves=f[self.n_violations :],
             error=error, lower=lower, upper=upper,
@@ -150,7 +151,7 @@ class CondensedQP:
         skipped = 0 if self.moves_bounded else m
         inputs = np.flatnonzero(np.tile(np.isfinite(limits.u_min) | np.isfinite(limits.u_max), n_c))
         inputs = inputs[inputs >= skipped]
-        # theta d - e <= y_max - free and theta d + e >= y_min - free at i = 1..np, e that output's violation.
+        # theta d - rho_i e <= y_max - free and theta d + rho_i e >= y_min - free, e that output's violation.
         predicted = np.arange(l, len(self.theta))
         self.above = predicted[np.isfinite(limits.y_max)[predicted % l]]
         self.below = predicted[np.isfinite(limits.y_min)[predicted % l]]
@@ -160,13 +161,16 @@ class CondensedQP:
         reach = np.abs(self.theta.reshape(-1, l, n)).max(axis=(0, 2))
         moving = np.abs(problem.move_weight).max() / np.maximum(reach, 1e-6) ** 2
         self.violation_scale = np.sqrt(np.maximum(np.maximum(tracking, moving), 1e-12))
+        # Row 0 is y_0, which nothing can limit.
+        fading = fade(problem.prediction_horizon)
+        self._fading_above, self._fading_below = fading[self.above // l], fading[self.below // l]
         violation = np.zeros((l, v))
         violation[limited] = np.diag(1 / self.violation_scale[limited])
         A = np.block(
             [
                 [np.zeros((len(inputs), v)), self.cumulate[inputs]],
-                [-violation[self.above % l], self.theta[self.above]],
-                [violation[self.below % l], self.theta[self.below]],
+                [-violation[self.above % l] * fading[self.above // l, None], self.theta[self.above]],
+                [violation[self.below % l] * fading[self.below // l, None], self.theta[self.below]],
             ]
         )
         H = np.block(
@@ -199,57 +203,6 @@ class CondensedQP:
         lower[self.below_rows] = -free[self.below]
         lower[self.below_rows, one] += limits.y_min[self.below % l]
         return lower, upper
-
-    def _tail(self, powers: Array, n_parameters: int) -> tuple[Array, Array]:
-        """Rows of error and weighted_theta for the tail of the horizon, as `TrackingProblem` defines it.
-
-        From sample np on the inputs stay, so zeta = (x_np, b, a) evolves by itself, with b = B u constant
-        and the error a - C x: the sum of its weighted squares is zeta' P zeta, P from a Lyapunov equation.
-        """
-        problem, model = self.problem, self.problem.model
-        n, m, l, n_c = model.n_states, model.n_inputs, model.n_outputs, problem.control_horizon
-        gamma = problem.tail_horizon / (1 + problem.tail_horizon)
-        radius = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0)
-        if not gamma * radius**2 < 1:
-            raise MampcError(
-                f"tail_horizon: expected below {1 / max(radius**2 - 1, 1e-16):.3g} samples for a model with a pole "
-                f"of size {radius:.4g}, received {problem.tail_horizon:g}; without inputs that move its errors grow"
-            )
-        eye, zero = np.eye(n), np.zeros((n, l))
-        F = np.block([[model.A, eye, zero], [0 * eye, eye, zero], [zero.T, zero.T, np.eye(l)]])
-        E = np.hstack([-model.C, zero.T, np.eye(l)])
-        F *= np.sqrt(gamma)
-        P = F.T @ E.T @ problem.output_weight @ E @ F
-        while F.any() and np.abs(F).max() > 1e-150:  # doubling: P_2k = P_k + F^k' P_k F^k
-            grown = P + F.T @ P @ F
-            if np.allclose(grown, P, rtol=1e-15, atol=0.0):
-                break
-            P, F = grown, F @ F
-
-        forced = np.concatenate(
-            [np.zeros((1, n, model.B.shape[1])), np.cumsum(powers[:-1] @ model.B, axis=0)]
-        )
-        columns = np.split(np.arange(n_parameters), np.cumsum([n, m, m, l, model.B.shape[1] - m, 1]))
-        x, u_previous, d_u, d_y, v, one, r = columns
-        zeta = np.zeros((2 * n + l, n_parameters))
-        for row, matrix in zip(
-            (slice(n), slice(n, 2 * n), slice(2 * n, None)), (forced[-1], model.B, -model.D), strict=True
-        ):
-            zeta[row, u_previous] = zeta[row, d_u] = matrix[:, :m]
-            zeta[row, v] = matrix[:, m:]
-            zeta[row, one] = -(matrix @ model.all_inputs_op)[:, None]
-        zeta[:n, x] = powers[-1]
-        zeta[2 * n :, one] -= model.y_op[:, None]
-        zeta[2 * n :, d_y], zeta[2 * n :, r[-l:]] = -np.eye(l), np.eye(l)
-        of_moves = np.vstack(
-            [
-                np.hstack([forced[problem.prediction_horizon - j][:, :m] for j in range(n_c)]),
-                np.tile(model.B[:, :m], n_c),
-                np.tile(-model.D[:, :m], n_c),
-            ]
-        )
-        root = _square_root(P)
-        return root @ zeta, -root @ of_moves
 
     def _optimum_maps(self, pattern: BoolArray) -> dict[str, Array]:
         """The optimum without limits on a pattern: its margins, moves, inputs and residual as maps of p."""
@@ -316,16 +269,21 @@ class CondensedQP:
         residual = instance.error - self.weighted_theta @ moves
         cost = residual @ residual + moves @ self.R @ moves
         if self.n_violations:
-            scaled = self.violation_scale * self.violations(instance, moves)
+            scaled = self.violation_scale * self.violations(instance, moves, faded=True)
             cost += self.problem.output_limit_weight * (scaled.sum() + 0.5 * (scaled @ scaled))
         return float(cost)
 
-    def violations(self, instance: Instance, moves: Array) -> Array:
-        """Largest predicted excess over its limits of each output over i = 1..np, shape (l,)."""
+    def violations(self, instance: Instance, moves: Array, *, faded: bool = False) -> Array:
+        """Largest predicted excess over its limits of each output over i = 1..np, shape (l,).
+
+        `faded`: the e of `TrackingProblem`, for which later excess counts more.
+        """
         l = self.problem.model.n_outputs
         excess = np.zeros(l)
         above = self.theta[self.above] @ moves - instance.upper[self.above_rows]
         below = instance.lower[self.below_rows] - self.theta[self.below] @ moves
+        if faded:
+            above, below = above / self._fading_above, below / self._fading_below
         # Rows come sample by sample, each with the same outputs.
         for over, outputs in ((above, self._above_outputs), (below, self._below_outputs)):
             if len(over):
@@ -395,8 +353,6 @@ def _stacked(**maps: Array) -> tuple[Array, Parts]:
     return np.ascontiguousarray(together), Parts(**at)
 
 
-def _square_root(weight: Array) -> Array:
-    """The symmetric S with S' S = weight, a positive semidefinite matrix."""
-    values, vectors = np.linalg.eigh(weight)
-    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return root
+def fade(n_p: int) -> Array:
+    """rho_i of `TrackingProblem` for i = 0..np, shape (np + 1,)."""
+    return np.interp(np.arange(n_p + 1), [1, max(n_p, 2)], [1.0, FADED])

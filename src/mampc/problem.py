@@ -57,12 +57,13 @@ class TrackingProblem:
 
         minimise   sum_{i=0..np} |r_i - y_i|^2_Q + sum_{j=0..nc-1} |du_j|^2_R + penalty(y limits) [+ tail]
         subject to u_min <= u_j <= u_max, |du_j| <= du_max     j = 0..nc-1
-                   y_min - e <= y_i <= y_max + e               i = 1..np
+                   y_min - rho_i e <= y_i <= y_max + rho_i e   i = 1..np
 
     with du_j = u_j - u_{j-1} and the input held at its last value beyond the control horizon. The
     violation e >= 0, one value per output for the whole horizon, costs w (a + a^2 / 2) with a = sqrt(q) e, q
     being the output's own weight (at least that of the moves, seen through the model): an exact penalty,
-    zero whenever the limits can be kept and w is large enough.
+    zero whenever the limits can be kept and w is large enough. rho falls evenly from 1 at i = 1 to 1/2 at np, so
+    that an output that is outside already is worth bringing back.
 
     Args:
         model: a discrete-time `StateSpace`.
