@@ -87,6 +87,7 @@ def run_study(
     """
     prepared = prepare(study, on_stage)
     regulators = {table.name: regulator_of(study, prepared.model, table) for table in study.controllers}
+    _reference(study, prepared)  # complains now rather than after the first results
     on_begin(prepared)
     runs: dict[str, dict[str, Run]] = {}
     for scenario in study.scenarios:
