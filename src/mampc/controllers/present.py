@@ -50,7 +50,9 @@ class PresentLimits:
         self.u_min = np.maximum(told("u_min", n_c), np.maximum(usual.u_min, -LARGEST / 2))
         self.u_max = np.minimum(told("u_max", n_c), np.minimum(usual.u_max, LARGEST / 2))
         self.du_max = np.clip(told("du_max", n_c), 0.0, usual.du_max)
-        self.y_min, self.y_max = told("y_min", n_p), told("y_max", n_p)
+        # Beyond what counts as a number a limit is as good as none, or as one that nothing can keep.
+        self.y_min = np.minimum(told("y_min", n_p), LARGEST)
+        self.y_max = np.maximum(told("y_max", n_p), -LARGEST)
         self.crossed = bool((self.u_min > self.u_max).any())
         self.planned_min, self.planned_max = self.u_min, self.u_max
 
