@@ -13,6 +13,7 @@ Array: TypeAlias = npt.NDArray[np.floating[Any]]  # float64 throughout
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
+FLOAT = np.dtype(np.float64)
 LARGEST = 1e12  # in engineering units; beyond it a number is a fault, and double precision has little left
 
 
@@ -37,6 +38,8 @@ def as_read(name: str, value: Any) -> Array:
 
 def as_shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     """Numbers of exactly this shape, as `as_read` takes them; `MampcError` otherwise."""
+    if type(value) is np.ndarray and value.dtype == FLOAT and value.shape == shape:  # as nearly always
+        return value
     array = as_read(name, value)
     if array.shape != shape:
         raise MampcError(f"{name}: expected shape {shape}, received {array.shape}")
