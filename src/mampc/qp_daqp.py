@@ -23,6 +23,7 @@ _STATUS = {
     -7: QPStatus.TIME_LIMIT,
 }
 ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
+KEPT = 5e-9  # relative to the largest bounded quantity: how far an optimum may break a bound
 LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
 
@@ -122,7 +123,11 @@ class DaqpSolver:
         z, _, flag, info = model.solve()
         if flag <= 0:
             return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
-        return QPSolution(z * scale, info["lam"] * scale, QPStatus.OPTIMAL, info["iterations"])
+        solution = QPSolution(z * scale, info["lam"] * scale, QPStatus.OPTIMAL, info["iterations"])
+        size = max(1.0, float(np.abs(self.program.rows(z * scale)).max()))
+        if self.program.primal_residual(lower, upper, solution) > KEPT * size:  # beyond double precision
+            return QPSolution(None, None, QPStatus.FAILED, info["iterations"])
+        return solution
 
     def start(self, active: Array | None = None) -> None:
         """Begin anew: the next solve starts from these active bounds, as `active_bounds` gives them, default none."""
