@@ -6,7 +6,7 @@ Every test is made against what the model predicts, since only that tells a faul
 - out of range: outside what the sensor can show;
 - jump: further from its prediction than `largest_jump`. Where it stays there (`confirm` samples within
   `largest_jump` of one another), it is the plant that jumped, and it is believed, unless it is a hundred times
-  as far as the inputs' whole range could move the output;
+  as far from the operating point as the inputs' whole range could move the output;
 - stuck: to the last bit the same for `stuck_after` samples, while the model moved that output by more than a
   fifth of `largest_jump`. It is believed again once it changes; or, where no other output is believed either, after
   ten times as long, since a plant at a hard stop (a tank that overflows) looks the same.
@@ -27,7 +27,7 @@ from mampc.sentences import Sentence
 
 OF_REACH = 0.1  # default jump, as a share of what the inputs' whole range does to an output
 GIVE_UP = 10  # times `stuck_after` samples blind: then a stuck sensor is believed again
-ABSURD = 100.0  # times that reach: a jump that no plant makes, never believed
+ABSURD = 100.0  # times that reach from the operating point: no plant gets there, and it is never believed
 STUCK = 0.2  # predicted movement, as a share of the largest jump, that a working sensor shows
 
 
@@ -104,7 +104,7 @@ class Sensors:
             raise MampcError(f"sensors: expected y_low < y_high, received {self._low} and {self._high}")
         self._low, self._high = np.maximum(self._low, -LARGEST), np.minimum(self._high, LARGEST)
         reach = _reach(problem)
-        jump, self._absurd = reach * OF_REACH, reach * ABSURD
+        jump, self._absurd, self._y_op = reach * OF_REACH, reach * ABSURD, problem.model.y_op
         if checks.largest_jump is not None:
             given = as_array("largest_jump", checks.largest_jump)
             jump = (
@@ -159,7 +159,7 @@ class Sensors:
         doubted = np.where(came, 0.0, state.doubted)
         near = jumped & (np.abs(y - state.y) <= self._jump)
         doubted[jumped] = 1.0
-        near &= np.abs(innovation) < self._absurd
+        near &= np.abs(y - self._y_op) < self._absurd
         doubted[near] += state.doubted[near]
         jump = jumped & (doubted < self._confirm)
         believed = came & ~stuck & ~jump
