@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -110,12 +110,3 @@ class QuadraticProgram:
         distance = np.where(pull > 0, upper - rows, rows - lower)
         active = pull != 0  # a bound without pull may be infinite
         return float(np.sum(np.abs(pull[active] * distance[active])))
-
-
-class QPSolver(Protocol):
-    """One back end: built for a `QuadraticProgram`, called with what changes."""
-
-    @property
-    def program(self) -> QuadraticProgram: ...
-
-    def solve(self, f: Array, lower: Array, upper: Array) -> QPSolution: ...
