@@ -292,6 +292,14 @@ def test_what_is_masked_is_not_believed_whatever_stands_behind_the_mask():
     assert same_to_the_bit(loop.step(state, masked, [1.0]), loop.step(state, [np.nan], [1.0]))
 
 
+@pytest.mark.parametrize("size", [-LARGEST, LARGEST])
+def test_a_measurement_just_too_large_is_missing_where_jumps_are_not_tested(size):
+    loop, _ = masked_loop()
+    loop = mampc.Regulator(loop.controller, sensors=mampc.SensorChecks(largest_jump=np.inf))
+    decision = loop.step(loop.initial_state(), [size], [1.0])
+    assert decision.ignored_outputs == {"y": Fault.MISSING}
+
+
 @pytest.mark.parametrize("nothing", [np.ma.masked_array([0.1], [True]), [None], [np.nan]], ids=str)
 @pytest.mark.parametrize("name", ["u_min", "u_max", "du_max"])
 def test_a_limit_of_this_sample_that_is_missing_is_the_usual_one(name, nothing):

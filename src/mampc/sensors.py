@@ -102,7 +102,8 @@ class Sensors:
         self._high = as_limit("y_high", checks.y_high, l, np.inf)
         if (self._low >= self._high).any():
             raise MampcError(f"sensors: expected y_low < y_high, received {self._low} and {self._high}")
-        self._low, self._high = np.maximum(self._low, -LARGEST), np.minimum(self._high, LARGEST)
+        largest = np.nextafter(LARGEST, 0.0)  # what is as large as `LARGEST` is missing, not in range
+        self._low, self._high = np.maximum(self._low, -largest), np.minimum(self._high, largest)
         reach = _reach(problem)
         jump, self._absurd, self._y_op = reach * OF_REACH, reach * ABSURD, problem.model.y_op
         if checks.largest_jump is not None:
