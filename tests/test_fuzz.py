@@ -176,7 +176,7 @@ class FaultyLoop(RuleBasedStateMachine):
         assert not all(held[-max(2, confirm) :])
 
     def teardown(self):
-        if hasattr(self, "loop"):
+        if getattr(self, "sound", False):  # else a step failed half-way
             self.recover()
 
     def measured(self):
@@ -190,6 +190,7 @@ class FaultyLoop(RuleBasedStateMachine):
 
     def step(self, y, applied=None, v=None):
         """One step of the regulator, and everything that must hold of its decision."""
+        self.sound = False
         decided, u_applied = self.history[-1], None
         if applied is not None:
             before = self.history[-2] if len(self.history) > 1 else decided
@@ -215,6 +216,7 @@ class FaultyLoop(RuleBasedStateMachine):
         self.check_belief(decision, y, v)
         self.state, self.y_last = decision.state, read(y)
         self.history.append(decision.u)
+        self.sound = True
         return decision
 
     def check(self, decision):

@@ -24,6 +24,7 @@ _STATUS = {
 }
 ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
 KEPT = 5e-9  # relative to the largest bounded quantity: how far an optimum may break a bound
+ORDINARY = 1e8  # length of f: up to here optima keep their bounds, and only longer ones are checked
 LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
 
@@ -75,7 +76,8 @@ class DaqpSolver:
                 f"received {f.shape}, {lower.shape}, {upper.shape}"
             )
         # Both comparisons are false for not-a-number; f beyond 1e154 is as good as infinite.
-        if not (f.dot(f) < np.inf and (lower <= upper).all()):
+        square = f.dot(f)
+        if not (square < np.inf and (lower <= upper).all()):
             return _BAD_DATA
         if not len(lower):  # daqp wants at least one row
             return QPSolution(-np.linalg.solve(self.program.H, f), lower, QPStatus.OPTIMAL, 0)
@@ -97,14 +99,16 @@ class DaqpSolver:
             self._local.model = None
             return _BAD_DATA
         z, _, flag, info = model.solve()
-        if flag <= 0:
-            self._local.model = None
-            status = _STATUS.get(flag, QPStatus.FAILED)
-            scale = self._scale(f)
-            if scale > 1 and status is not QPStatus.TIME_LIMIT:
-                return self._solve_scaled(f, lower, upper, scale)
-            return QPSolution(None, None, status, info["iterations"])
-        return QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
+        if flag > 0:
+            solution = QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
+            if square <= ORDINARY**2 or self._keeps(solution, lower, upper):
+                return solution
+        self._local.model = None
+        status = QPStatus.FAILED if flag > 0 else _STATUS.get(flag, QPStatus.FAILED)
+        scale = self._scale(f)
+        if scale > 1 and status is not QPStatus.TIME_LIMIT:
+            return self._solve_scaled(f, lower, upper, scale)
+        return QPSolution(None, None, status, info["iterations"])
 
     def _scale(self, f: Array) -> float:
         """A power of two by which to divide z, where its numbers are too large for an absolute tolerance, else 1.
@@ -124,10 +128,16 @@ class DaqpSolver:
         if flag <= 0:
             return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
         solution = QPSolution(z * scale, info["lam"] * scale, QPStatus.OPTIMAL, info["iterations"])
-        size = max(1.0, float(np.abs(self.program.rows(z * scale)).max()))
-        if self.program.primal_residual(lower, upper, solution) > KEPT * size:  # beyond double precision
-            return QPSolution(None, None, QPStatus.FAILED, info["iterations"])
-        return solution
+        if self._keeps(solution, lower, upper):
+            return solution
+        return QPSolution(None, None, QPStatus.FAILED, info["iterations"])
+
+    def _keeps(self, solution: QPSolution, lower: Array, upper: Array) -> bool:
+        """Whether a solution is within the bounds, but for rounding: data beyond double precision give others."""
+        if solution.z is None:
+            return False
+        size = max(1.0, float(np.abs(self.program.rows(solution.z)).max()))
+        return self.program.primal_residual(lower, upper, solution) <= KEPT * size
 
     def start(self, active: Array | None = None) -> None:
         """Begin anew: the next solve starts from these active bounds, as `active_bounds` gives them, default none."""
