@@ -23,8 +23,8 @@ _STATUS = {
     -7: QPStatus.TIME_LIMIT,
 }
 ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
-KEPT = 5e-9  # relative to the largest bounded quantity: how far an optimum may break a bound
-ORDINARY = 1e8  # length of f: up to here optima keep their bounds, and only longer ones are checked
+ROUNDING = 5e-9  # relative to the sizes of the data: how far an optimum may miss its conditions
+ORDINARY = 1e8  # length of f: up to here what daqp calls an optimum is one, and only longer ones are checked
 LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
 
@@ -101,7 +101,7 @@ class DaqpSolver:
         z, _, flag, info = model.solve()
         if flag > 0:
             solution = QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
-            if square <= ORDINARY**2 or self._keeps(solution, lower, upper):
+            if square <= ORDINARY**2 or self._is_optimal(solution, f, lower, upper):
                 return solution
         self._local.model = None
         status = QPStatus.FAILED if flag > 0 else _STATUS.get(flag, QPStatus.FAILED)
@@ -128,16 +128,22 @@ class DaqpSolver:
         if flag <= 0:
             return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
         solution = QPSolution(z * scale, info["lam"] * scale, QPStatus.OPTIMAL, info["iterations"])
-        if self._keeps(solution, lower, upper):
+        if self._is_optimal(solution, f, lower, upper):
             return solution
         return QPSolution(None, None, QPStatus.FAILED, info["iterations"])
 
-    def _keeps(self, solution: QPSolution, lower: Array, upper: Array) -> bool:
-        """Whether a solution is within the bounds, but for rounding: data beyond double precision give others."""
-        if solution.z is None:
+    def _is_optimal(self, solution: QPSolution, f: Array, lower: Array, upper: Array) -> bool:
+        """Whether the optimality conditions hold but for rounding: data beyond double precision give others."""
+        z, pull, program = solution.z, solution.multipliers, self.program
+        if z is None or pull is None:
             return False
-        size = max(1.0, float(np.abs(self.program.rows(solution.z)).max()))
-        return self.program.primal_residual(lower, upper, solution) <= KEPT * size
+        size = max(1.0, float(np.abs(program.rows(z)).max()))
+        gradient = max(float(np.abs(f).max()), float(np.abs(pull).max()))
+        return (
+            program.primal_residual(lower, upper, solution) <= ROUNDING * size
+            and program.dual_residual(f, solution) <= ROUNDING * gradient
+            and program.duality_gap(lower, upper, solution) <= ROUNDING * gradient * size
+        )
 
     def start(self, active: Array | None = None) -> None:
         """Begin anew: the next solve starts from these active bounds, as `active_bounds` gives them, default none."""
