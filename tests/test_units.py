@@ -62,3 +62,31 @@ def test_with_the_default_weights_too_units_far_apart_are_controlled(name, u, y)
     assert set(outcome.statuses) <= {"optimal", "feasible", "warm_up"}
     assert (np.abs(outcome.u - model.u_op * u) <= 0.8 * u * (1 + 1e-9)).all()
     assert (np.abs(outcome.y[-1] - outcome.r[-1]) < 0.05 * y).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_inputs_in_units_far_from_one_another_take_no_more_iterations(seed):
+    """daqp by itself cycles there; and its answers depend on what it solved before."""
+    rng = np.random.default_rng(seed)
+    model = random_model(seed, n=4, m=3, l=3, radius=0.9)
+    u, y = 10.0 ** rng.integers(-3, 4, 3), 10.0 ** rng.integers(-3, 4, (3, 1))
+    model = mampc.StateSpace(model.A, model.B / u, model.C * y, None, model.dt)
+    y = y[:, 0]
+    problem = mampc.TrackingProblem(
+        model,
+        prediction_horizon=8,
+        control_horizon=3,
+        output_weight=1 / y**2,
+        move_weight=0.1 / u**2,
+        limits=mampc.Limits(u_min=-u, u_max=u, du_max=0.5 * u, y_min=-y, y_max=y),
+    )
+    for controller in (mampc.MPC(problem), mampc.MAMPC(problem, mampc.MoveRules(price=0.5))):
+        loop = mampc.Regulator(controller, sensors=mampc.SensorChecks(largest_jump=np.inf, stuck_after=None))
+        state = loop.initial_state()
+        for _ in range(30):
+            told = rng.standard_normal(3) * y, rng.standard_normal(3) * 2 * y
+            decision, again = loop.step(state, *told), loop.step(state, *told)
+            assert decision.status == "optimal"
+            assert decision.iterations < 100
+            np.testing.assert_array_equal(again.u, decision.u)
+            state = decision.state

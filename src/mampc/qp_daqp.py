@@ -25,6 +25,7 @@ _STATUS = {
 ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
 ROUNDING = 5e-9  # relative to the sizes of the data: how far an optimum may miss its conditions
 ORDINARY = 1e8  # length of f: up to here what daqp calls an optimum is one, and only longer ones are checked
+EVEN = 5  # powers of two: units of variables this near to those that make H even are left alone
 LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
 
@@ -55,6 +56,14 @@ class DaqpSolver:
             "iter_limit": iteration_limit,
             "time_limit": 0.0 if time_limit is None else time_limit,
         }
+        # daqp cycles where variables are of very different sizes: it gets them in units that make H even.
+        # Powers of two leave every digit as it is.
+        size = np.sqrt(np.diag(program.H))
+        self._units: Array | None = None
+        if (np.abs(np.log2(size)) > EVEN).any():
+            self._units = 2.0 ** -np.round(np.log2(size))
+            self._per_unit = np.ones(program.n_bounds)
+            self._per_unit[: program.n_simple] /= self._units[: program.n_simple]
         self._inactive = np.zeros(program.n_bounds, dtype=np.intc)
         self._f_shape = (program.n_variables,)
         self._bound_shape = (program.n_bounds,)
@@ -85,8 +94,7 @@ class DaqpSolver:
         if model is None:
             model = self._local.model = self._fresh_model()
             self._local.active = getattr(self._local, "active", None)
-        # daqp reads memory as contiguous doubles and keeps references to it: hand it copies of its own.
-        changed: dict[str, Any] = {"f": _own(f), "blower": _own(lower), "bupper": _own(upper)}
+        changed = self._changed(f, lower, upper)
         active, self._local.active = self._local.active, None
         if active is self._inactive:
             changed["sense"] = active
@@ -100,7 +108,7 @@ class DaqpSolver:
             return _BAD_DATA
         z, _, flag, info = model.solve()
         if flag > 0:
-            solution = QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
+            solution = self._solution(z, info)
             if square <= ORDINARY**2 or self._is_optimal(solution, f, lower, upper):
                 return solution
         self._local.model = None
@@ -122,15 +130,30 @@ class DaqpSolver:
     def _solve_scaled(self, f: Array, lower: Array, upper: Array, scale: float) -> QPSolution:
         """The same program in z / scale, which has the same H and A."""
         model = self._fresh_model()
-        if model.update(f=_own(f / scale), blower=_own(lower / scale), bupper=_own(upper / scale)) < 0:
+        if model.update(**self._changed(f / scale, lower / scale, upper / scale)) < 0:
             return _BAD_DATA
         z, _, flag, info = model.solve()
         if flag <= 0:
             return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])
-        solution = QPSolution(z * scale, info["lam"] * scale, QPStatus.OPTIMAL, info["iterations"])
+        solution = self._solution(z, info, scale)
         if self._is_optimal(solution, f, lower, upper):
             return solution
         return QPSolution(None, None, QPStatus.FAILED, info["iterations"])
+
+    def _changed(self, f: Array, lower: Array, upper: Array) -> dict[str, Any]:
+        """The data in daqp's units. It reads contiguous doubles and keeps references: these are its own copies."""
+        if self._units is None:
+            return {"f": _own(f), "blower": _own(lower), "bupper": _own(upper)}
+        return {"f": f * self._units, "blower": lower * self._per_unit, "bupper": upper * self._per_unit}
+
+    def _solution(self, z: Array, info: dict[str, Any], scale: float = 1.0) -> QPSolution:
+        """An optimum in daqp's units, divided by `scale`, in the program's."""
+        pull = info["lam"]
+        if self._units is not None:
+            z, pull = z * self._units, pull * self._per_unit
+        if scale != 1.0:
+            z, pull = z * scale, pull * scale
+        return QPSolution(z, pull, QPStatus.OPTIMAL, info["iterations"])
 
     def _is_optimal(self, solution: QPSolution, f: Array, lower: Array, upper: Array) -> bool:
         """Whether the optimality conditions hold but for rounding: data beyond double precision give others."""
@@ -153,11 +176,14 @@ class DaqpSolver:
         import daqp
 
         program = self.program
+        H, A = program.H, program.A
+        if self._units is not None:
+            H, A = H * np.outer(self._units, self._units), A * self._units
         model = daqp.Model()
         model.settings = self._settings
         bound = np.full(program.n_bounds, UNBOUNDED)
         flag, _ = model.setup(
-            np.ascontiguousarray(program.H), np.zeros(program.n_variables), np.ascontiguousarray(program.A),
+            np.ascontiguousarray(H), np.zeros(program.n_variables), np.ascontiguousarray(A),
             bound, -bound, np.zeros(program.n_bounds, dtype=np.intc),
         )  # fmt: skip
         if flag < 0:
