@@ -229,3 +229,53 @@ def test_sensor_checks_out_of_range_are_refused(options):
         tank_regulator(sensors=mampc.SensorChecks(**options))
     with pytest.raises(mampc.MampcError, match=r"expected.*received"):
         tank_regulator(max_blind_steps=-1)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.4, 1.0, 2.0])
+@pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=1.0)])
+def test_a_coarse_sensor_is_not_stuck_while_the_controller_balances_a_load(rules, step):
+    """Its number stays the same for many samples although the inputs move: a load moves the other way."""
+    model = mampc.StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0)
+    limits = mampc.Limits(u_min=-50.0, u_max=50.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=20, control_horizon=5, limits=limits)
+    loads = {
+        "slow ramp": lambda k: -0.05 * min(max(0, k - 50), 100),
+        "fast ramp": lambda k: -0.3 * min(max(0, k - 50), 100),
+        "slow wave": lambda k: 8.0 * np.sin(k / 32.0),
+    }
+    for load in loads.values():
+        loop = mampc.Regulator(mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules))
+        state, x = loop.initial_state([0.0], [0.0]), 0.0
+        for k in range(300):
+            decision = loop.step(state, [step * round(x / step)], [10.3 if k > 10 else 0.0])
+            assert decision.ignored_outputs == {}
+            state = decision.state
+            x = 0.9 * x + 0.1 * (0.85 * decision.u[0] + load(k))
+
+
+def test_a_coarse_sensor_that_is_stuck_is_found_in_the_end():
+    model = mampc.StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0)
+    limits = mampc.Limits(u_min=-50.0, u_max=50.0, du_max=0.5)
+    problem = mampc.TrackingProblem(model, prediction_horizon=20, control_horizon=5, limits=limits)
+    loop = mampc.Regulator(mampc.MPC(problem))
+    state, x, faults = loop.initial_state([0.0], [0.0]), 0.0, []
+    for k in range(200):
+        shown = 4.0 if k > 60 else 0.4 * round(x / 0.4)
+        decision = loop.step(state, [shown], [10.0 if k > 60 else 4.1 if k > 10 else 0.0])
+        state = decision.state
+        faults.append(decision.ignored_outputs.get("y1"))
+        x = 0.9 * x + 0.1 * decision.u[0]
+    assert Fault.STUCK in faults[100:]
+    assert Fault.STUCK not in faults[:100]
+
+
+def test_an_output_that_washes_out_has_a_largest_jump_too():
+    """At rest the input does next to nothing to it; soon after a move it does much."""
+    A, B, C = np.diag([0.6, 0.95]), np.array([[0.4], [0.05]]), np.array([[1.0, -0.97]])
+    model = mampc.StateSpace(A, B, C, None, 1.0)
+    limits = mampc.Limits(u_min=-50.0, u_max=50.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=60, control_horizon=5, limits=limits)
+    decisions, *_ = plant_loop(
+        mampc.Regulator(mampc.MPC(problem)), 200, lambda k, y: y, noise=0.3, reference=np.ones(1)
+    )
+    assert not any(d.ignored_outputs for d in decisions)

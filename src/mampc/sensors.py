@@ -8,8 +8,11 @@ Every test is made against what the model predicts, since only that tells a faul
   `largest_jump` of one another), it is the plant that jumped, and it is believed, unless it is a hundred times
   as far from the operating point as the inputs' whole range could move the output;
 - stuck: to the last bit the same for `stuck_after` samples, while the model moved that output by more than a
-  fifth of `largest_jump`. It is believed again once it changes; or, where no other output is believed either, after
-  ten times as long, since a plant at a hard stop (a tank that overflows) looks the same.
+  fifth of `largest_jump`. A coarse sensor, whose every change was a multiple of one step and that no small one,
+  may show the same for long while the controller balances a load: it takes ten times as many samples, and
+  movement by all of `largest_jump`. A stuck sensor is believed again once it changes; or, where no other output
+  is believed either, after ten times as long, since a plant at a hard stop (a tank that overflows) looks the
+  same.
 """
 
 from __future__ import annotations
@@ -26,8 +29,11 @@ from mampc.problem import TrackingProblem
 from mampc.sentences import Sentence
 
 OF_REACH = 0.1  # default jump, as a share of what the inputs' whole range does to an output
+SOON = 10  # samples
 GIVE_UP = 10  # times `stuck_after` samples blind: then a stuck sensor is believed again
 ABSURD = 100.0  # times that reach from the operating point: no plant gets there, and it is never believed
+COARSE = 5e-3  # times the largest jump: a sensor with larger steps, and that shows nothing between them
+PATIENCE = 10  # times `stuck_after`: how long the number of a coarse sensor may stay the same
 STUCK = 0.2  # predicted movement, as a share of the largest jump, that a working sensor shows
 
 
@@ -82,6 +88,7 @@ class SensorState:
         moved: how far the model moved the output meanwhile; `LARGEST` once it counts as stuck.
         doubted: how many samples in a row jumped to about the same place.
         disturbance: estimated at the output when its present number first came.
+        step: that all its changes were multiples of, as long as it is not small; `LARGEST` before the first.
         blind: samples in a row without any output believed.
     """
 
@@ -90,6 +97,7 @@ class SensorState:
     moved: Array
     doubted: Array
     disturbance: Array
+    step: Array
     blind: int = 0
 
 
@@ -121,7 +129,9 @@ class Sensors:
         self._stuck_after = np.inf if checks.stuck_after is None else checks.stuck_after
         self._names = problem.model.names.outputs
         self._all, self._none = np.ones(l, dtype=bool), np.zeros(l)
-        self._start = SensorState(*(self._none,) * 5)
+        self._fine = COARSE * jump
+        self._moving = np.minimum(STUCK * jump, LARGEST / 2)
+        self._start = SensorState(*(self._none,) * 5, np.full(l, LARGEST))
 
     def initial(self) -> SensorState:
         """Before the first sample."""
@@ -144,15 +154,18 @@ class Sensors:
         """
         fine = (np.abs(innovation) <= self._jump) & (y != state.y) & (y >= self._low) & (y <= self._high)
         if fine.all():  # the everyday case, at once
-            return self._all, {}, SensorState(y.copy(), self._none, self._none, self._none, disturbance)
+            none, step = self._none, self._step(state, y, self._all)
+            return self._all, {}, SensorState(y.copy(), none, none, none, disturbance, step)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))
         came = ~(missing | out)
         same = came & (y == state.y)
+        changed = came & ~same
         repeats = np.where(came, np.where(same, state.repeats + 1, 0), state.repeats)
-        moved = np.where(came & ~same, 0.0, state.moved + movement)
-        moving = np.abs(moved) > np.minimum(STUCK * self._jump, LARGEST / 2)
-        stuck = same & (repeats >= self._stuck_after) & moving
+        moved = np.where(changed, 0.0, state.moved + movement)
+        coarse = (state.step > self._fine) & (state.step < LARGEST)
+        long = repeats >= np.where(coarse, PATIENCE * self._stuck_after, self._stuck_after)
+        stuck = same & long & (np.abs(moved) > np.where(coarse, self._jump, self._moving))
         if state.blind >= GIVE_UP * self._stuck_after:
             repeats[stuck], moved[stuck], stuck = 0.0, 0.0, np.zeros_like(stuck)
         moved[stuck] = LARGEST
@@ -166,7 +179,8 @@ class Sensors:
         believed = came & ~stuck & ~jump
         after = SensorState(
             np.where(came, y, state.y), repeats, moved, doubted,
-            np.where(came & ~same, disturbance, state.disturbance), 0 if believed.any() else state.blind + 1,
+            np.where(changed, disturbance, state.disturbance), self._step(state, y, changed),
+            0 if believed.any() else state.blind + 1,
         )  # fmt: skip
         faults = {}
         for fault, affected in (
@@ -174,6 +188,17 @@ class Sensors:
         ):  # fmt: skip
             faults.update({self._names[i]: fault for i in np.flatnonzero(affected)})
         return believed, faults, after
+
+    def _step(self, state: SensorState, y: Array, changed: BoolArray) -> Array:
+        """The greatest common divisor of all changes so far, shape (l,), found step by step."""
+        step = state.step
+        if not (step > self._fine).any():
+            return step
+        change = np.abs(y - state.y)
+        rest = np.fmod(change, step)
+        rest = np.minimum(rest, step - rest)
+        finer: Array = np.where(changed & (rest > 1e-3 * np.minimum(change, step)), rest, step)
+        return finer
 
 
 def newly_stuck(before: SensorState, after: SensorState) -> BoolArray:
@@ -183,9 +208,13 @@ def newly_stuck(before: SensorState, after: SensorState) -> BoolArray:
 
 
 def _reach(problem: TrackingProblem) -> Array:
-    """How far the whole range of the inputs moves each output at rest, shape (l,)."""
-    model, limits = problem.model, problem.limits
-    gain = np.abs(static_response(model)[:, : model.n_inputs])
+    """How far the whole range of the inputs moves each output, at rest or soon, shape (l,)."""
+    model, limits, m = problem.model, problem.limits, problem.model.n_inputs
+    response, gain = model.D[:, :m], np.abs(static_response(model)[:, :m])
+    state = model.B[:, :m]
+    for _ in range(SOON):  # an output that washes out is not moved at rest
+        response, state = response + model.C @ state, model.A @ state
+        gain = np.maximum(gain, np.abs(response))
     ranges = np.broadcast_to(limits.u_max - limits.u_min, gain.shape)
     reach: Array = (gain * np.where(gain > 0, ranges, 0.0)).sum(axis=1)
     return np.where(reach > 0, reach, np.inf)
