@@ -22,6 +22,34 @@ def scaled(model, u, y):
     )
 
 
+@pytest.mark.parametrize(("u", "y"), [(1e-6, 1.0), (1e-5, 1e-5), (1.0, 1e-6), (1e-6, 1e6), (1e6, 1e-6)])
+@pytest.mark.parametrize("rules", [None, mampc.MoveRules(max_moves=3), mampc.MoveRules(price=0.5)], ids=str)
+def test_optima_are_the_same_in_small_and_large_units(rules, u, y):
+    """One sample each of many problems with active limits."""
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        usual = random_model(seed, n=3, m=2, l=2, radius=0.9)
+        x, reference = rng.standard_normal(3), 3 * rng.standard_normal(2)
+        objectives = []
+        for u_unit, y_unit in ((1.0, 1.0), (u, y)):
+            model = scaled(usual, u_unit, y_unit)
+            limits = mampc.Limits(
+                u_min=model.u_op - u_unit,
+                u_max=model.u_op + u_unit,
+                du_max=0.8 * u_unit,
+                y_max=model.y_op + y_unit * np.array([1.5, np.inf]),
+            )
+            problem = mampc.TrackingProblem(
+                model, prediction_horizon=8, control_horizon=3, limits=limits,
+                output_weight=1 / y_unit**2, move_weight=0.1 / u_unit**2,
+            )  # fmt: skip
+            controller = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules)
+            decision = controller.step(controller.initial_state(), x, model.y_op + y_unit * reference)
+            assert decision.status == "optimal"
+            objectives.append(decision.objective)
+        assert objectives[1] == pytest.approx(objectives[0], rel=1e-6)
+
+
 def run(model, u, y, settings, weights):
     limits = mampc.Limits(
         u_min=(model.u_op - 0.8) * u,

@@ -25,7 +25,7 @@ _STATUS = {
 ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
 ROUNDING = 5e-9  # relative to the sizes of the data: how far an optimum may miss its conditions
 ORDINARY = 1e8  # length of f: up to here what daqp calls an optimum is one, and only longer ones are checked
-EVEN = 5  # powers of two: units of variables this near to those that make H even are left alone
+EVEN = 5  # powers of two: units of variables and rows that are this near to even ones are left alone
 LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
 
@@ -56,14 +56,7 @@ class DaqpSolver:
             "iter_limit": iteration_limit,
             "time_limit": 0.0 if time_limit is None else time_limit,
         }
-        # daqp cycles where variables are of very different sizes: it gets them in units that make H even.
-        # Powers of two leave every digit as it is.
-        size = np.sqrt(np.diag(program.H))
-        self._units: Array | None = None
-        if (np.abs(np.log2(size)) > EVEN).any():
-            self._units = 2.0 ** -np.round(np.log2(size))
-            self._per_unit = np.ones(program.n_bounds)
-            self._per_unit[: program.n_simple] /= self._units[: program.n_simple]
+        self._units, self._per_unit = _even_units(program)
         self._inactive = np.zeros(program.n_bounds, dtype=np.intc)
         self._f_shape = (program.n_variables,)
         self._bound_shape = (program.n_bounds,)
@@ -178,7 +171,8 @@ class DaqpSolver:
         program = self.program
         H, A = program.H, program.A
         if self._units is not None:
-            H, A = H * np.outer(self._units, self._units), A * self._units
+            H = H * np.outer(self._units, self._units)
+            A = A * np.outer(self._per_unit[program.n_simple :], self._units)
         model = daqp.Model()
         model.settings = self._settings
         bound = np.full(program.n_bounds, UNBOUNDED)
@@ -200,6 +194,21 @@ class DaqpSolver:
             time_limit=settings["time_limit"] or None,
             iteration_limit=settings["iter_limit"],
         )
+
+
+def _even_units(program: QuadraticProgram) -> tuple[Array | None, Array]:
+    """Units of the variables, shape (n,), that make H even, and what bounds are multiplied by, shape (n_bounds,).
+
+    daqp cycles, and misses bounds, where variables or rows are of very different sizes. Powers of two leave
+    every digit as it is. The units are None where the program is even as it is.
+    """
+    units = 2.0 ** -np.round(0.5 * np.log2(np.diag(program.H)))
+    rows = np.sqrt(np.square(program.A * units).sum(axis=1))
+    per_unit = np.concatenate(
+        (1 / units[: program.n_simple], 2.0 ** -np.round(np.log2(np.where(rows > 0, rows, 1.0))))
+    )
+    uneven = np.abs(np.log2(np.concatenate((units, per_unit)))).max(initial=0.0) > EVEN
+    return (units if uneven else None), per_unit
 
 
 def active_bounds(multipliers: Array) -> Array:

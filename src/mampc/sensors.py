@@ -194,10 +194,10 @@ class Sensors:
         step = state.step
         if not (step > self._fine).any():
             return step
-        change = np.abs(y - state.y)
+        change = np.where(changed, np.abs(y - state.y), 0.0)
         rest = np.fmod(change, step)
         rest = np.minimum(rest, step - rest)
-        finer: Array = np.where(changed & (rest > 1e-3 * np.minimum(change, step)), rest, step)
+        finer: Array = np.where(rest > 1e-3 * np.minimum(change, step), rest, step)
         return finer
 
 
