@@ -104,6 +104,10 @@ def test_a_tracking_problem_wants_a_discrete_model(model):
         {"sparsity_horizon": 1.5},
         {"sparsity_horizon": None},
         {"sparsity_horizon": 10**9},
+        {"price": True},
+        {"price": [True, False]},
+        {"min_size": True},
+        {"blocks": ((1, 2), (1, 1))},
     ],
     ids=by_name,
 )
@@ -158,6 +162,17 @@ def test_a_controller_wants_a_problem_rules_and_a_method_it_knows():
     refuses(mampc.MAMPC, problem, 3)
     for method in ("newton", "", None, 7, mampc.Alternating):
         refuses(mampc.MAMPC, problem, rules, method=method)
+
+
+def test_a_state_of_something_else_is_refused():
+    problem = tank_problem()
+    mpc, sparse = mampc.MPC(problem), mampc.MAMPC(problem, mampc.MoveRules(max_moves=3, sparsity_horizon=4))
+    x, reference = np.zeros(problem.model.n_states), problem.model.y_op
+    for state in (None, [1.0, 2.0], mampc.Regulator(mpc).initial_state()):
+        refuses(mpc.step, state, x, reference)
+        refuses(sparse.step, state, x, reference)
+    refuses(mpc.step, sparse.initial_state(), x, reference)
+    refuses(sparse.step, mpc.initial_state(), x, reference)
 
 
 @pytest.mark.parametrize(

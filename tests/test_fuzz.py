@@ -231,6 +231,9 @@ class FaultyLoop(RuleBasedStateMachine):
         inside = (last >= ranges.low[0]) & (last <= ranges.high[0])
         rounding = 1e-9 + 4 * np.spacing(np.abs(last))
         assert (np.abs(u - last) <= ranges.du_max + rounding)[inside].all()
+        by_hand = np.zeros(len(u), dtype=bool) if self.manual is None else np.array(self.manual)
+        if (np.abs(u - last) > ranges.du_max + rounding)[~by_hand].any():
+            assert Remark.BACK_INSIDE in decision.remarks
         if self.manual is not None:
             np.testing.assert_array_equal(u[self.manual], inside_now[self.manual])
             stays = [np.clip(row, ranges.low, ranges.high) == decision.plan for row in (last, inside_now)]
@@ -248,7 +251,6 @@ class FaultyLoop(RuleBasedStateMachine):
             assert keeps_rules(rules, past, decision.moves)
             own = np.abs(u - last)
             large = (own >= np.max(rules.min_size) - 1e-8) | (np.abs(u) == LARGEST / 2)
-            by_hand = np.zeros(len(u), dtype=bool) if self.manual is None else self.manual
             assert ((own == 0) | large | by_hand).all()  # clipping what is held by hand is no move
 
     def check_belief(self, decision, y, v):

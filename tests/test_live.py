@@ -258,6 +258,35 @@ def test_an_input_held_outside_its_limits_by_hand_is_predicted_where_it_is(rules
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_an_input_held_outside_its_limits_by_hand_is_not_planned_back_with_the_others(method):
+    problem = random_problem(3)
+    last = problem.model.u_op + np.array([1.7, -3.0])
+    controller = controller_of(method, problem)
+    decision = controller.step(
+        controller.initial_state(last), np.ones(3), problem.model.y_op + 3, manual=[False, True]
+    )
+    assert not decision.changes[:, 1].any()
+    np.testing.assert_array_equal(decision.plan[:, 1], problem.limits.u_min[1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_inputs_held_outside_limits_that_came_at_run_time_go_inside_and_that_is_said(method):
+    """But for those in manual, which somebody else moves: they are only told to be there."""
+    problem = random_problem(3)
+    u_op, controller = problem.model.u_op, controller_of(method, problem)
+    tighter, y = mampc.Limits(u_min=u_op + 0.9), problem.model.y_op
+    state = controller.initial_state(u_op)
+    by_hand = controller.step(state, np.zeros(3), y, limits=tighter, manual=[True, True])
+    blind = controller.step(state, np.full(3, np.nan), y, limits=tighter)
+    for decision in (by_hand, blind):
+        np.testing.assert_array_equal(decision.u, u_op + 0.9)  # further than du_max
+    assert blind.remarks == (Remark.BACK_INSIDE,)
+    assert by_hand.remarks == ()
+    usual = controller.step(state, np.full(3, np.nan), y)
+    assert usual.remarks == ()
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_the_way_back_inside_is_all_that_an_input_moves_by_where_moves_are_limited(method):
     model = mampc.StateSpace([[0.9]], [[0.5]], [[1.0]], None, 1.0)
     limits = mampc.Limits(u_min=0.0, u_max=10.0, du_max=2.0)

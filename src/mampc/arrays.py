@@ -47,10 +47,10 @@ def as_shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:
 
 
 def as_array(name: str, value: Any) -> Array:
-    """A new, contiguous float64 array; raises `MampcError` for text, ragged lists or complex numbers."""
+    """A new, contiguous float64 array; raises `MampcError` for text, ragged lists, complex numbers or flags."""
     try:
         array = np.array(value)
-        if array.dtype.kind not in "biuf":
+        if array.dtype.kind not in "iuf":
             raise TypeError
         return np.ascontiguousarray(array, dtype=np.float64).reshape(array.shape)
     except (TypeError, ValueError):

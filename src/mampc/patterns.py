@@ -74,7 +74,7 @@ class MoveRules:
                 "price: expected one price per sample with counting='simultaneous', received one per input"
             )
         if self.blocks is not None:
-            lengths = np.atleast_1d(np.asarray(self.blocks, dtype=object)).ravel().tolist()
+            lengths = self.blocks if np.iterable(self.blocks) else [self.blocks]
             object.__setattr__(self, "blocks", tuple(as_whole("blocks", length, 1) for length in lengths))
             if not self.blocks:
                 raise MampcError("blocks: expected at least one block, received none")

@@ -88,11 +88,13 @@ class QuadraticProgram:
         return np.concatenate([z[: self.n_simple], self.A @ z])
 
     def primal_residual(self, lower: Array, upper: Array, solution: QPSolution) -> float:
-        """Largest violation of a bound, in the unit of its row; infinite without a solution."""
+        """Largest violation of a bound, over the length of its row if above 1; infinite without a solution."""
         if solution.z is None:
             return np.inf
         rows = self.rows(solution.z)
-        return float(max(0.0, np.max(lower - rows, initial=0.0), np.max(rows - upper, initial=0.0)))
+        excess = np.maximum(lower - rows, rows - upper)
+        excess[self.n_simple :] /= np.maximum(1.0, np.linalg.norm(self.A, axis=1))
+        return float(np.max(excess, initial=0.0))
 
     def dual_residual(self, f: Array, solution: QPSolution) -> float:
         """Largest entry of the gradient of the Lagrangian; infinite without a solution."""

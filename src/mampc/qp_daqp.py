@@ -42,17 +42,23 @@ class DaqpSolver:
         program: the constant part.
         time_limit: seconds a solve may take, None for no limit.
         iteration_limit: active-set changes a solve may take.
+        tolerance: to within which bounds are kept, in daqp's units.
 
     Raises:
         MampcError: daqp refuses the program.
     """
 
     def __init__(
-        self, program: QuadraticProgram, *, time_limit: float | None = None, iteration_limit: int = 10_000
+        self,
+        program: QuadraticProgram,
+        *,
+        time_limit: float | None = None,
+        iteration_limit: int = 10_000,
+        tolerance: float = 1e-9,
     ) -> None:
         self.program = program
         self._settings = {
-            "primal_tol": 1e-9,
+            "primal_tol": tolerance,
             "iter_limit": iteration_limit,
             "time_limit": 0.0 if time_limit is None else time_limit,
         }
@@ -193,16 +199,18 @@ class DaqpSolver:
             state["program"],
             time_limit=settings["time_limit"] or None,
             iteration_limit=settings["iter_limit"],
+            tolerance=settings["primal_tol"],
         )
 
 
 def _even_units(program: QuadraticProgram) -> tuple[Array | None, Array]:
-    """Units of the variables, shape (n,), that make H even, and what bounds are multiplied by, shape (n_bounds,).
+    """Units of the variables, shape (n,), that make the diagonal of H even, and factors of the bounds, (n_bounds,).
 
     daqp cycles, and misses bounds, where variables or rows are of very different sizes. Powers of two leave
     every digit as it is. The units are None where the program is even as it is.
     """
     units = 2.0 ** -np.round(0.5 * np.log2(np.diag(program.H)))
+    units /= max(1.0, units.min(initial=1.0))  # a small cost makes no variable small
     rows = np.sqrt(np.square(program.A * units).sum(axis=1))
     per_unit = np.concatenate(
         (1 / units[: program.n_simple], 2.0 ** -np.round(np.log2(np.where(rows > 0, rows, 1.0))))

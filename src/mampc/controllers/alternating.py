@@ -43,9 +43,9 @@ class Alternating(Heuristic):
         tolerance: eps1 > 0; stop when the plan changes by no more, sum of |u| in engineering units.
         max_iterations: rounds of both steps at most.
         polish: solve once more on the chosen pattern, with all other moves exactly zero and the rules
-            strictly kept.
+            strictly kept. Implied by `certify`, since a proof is about plans that keep the rules.
         warm_up: samples of plain MPC at the start; default the sparsity horizon.
-        certify: see `Heuristic`; the bound is that of exactly sparse plans, which `polish` gives.
+        certify: see `Heuristic`.
     """
 
     penalty: float = 10.0
@@ -73,7 +73,7 @@ class AlternatingSearch(HeuristicSearch):
 
     def __init__(self, settings: Alternating, condensed: CondensedQP, rules: MoveRules) -> None:
         super().__init__(settings, condensed, rules)
-        self.settings = settings
+        self.settings, self._polish = settings, settings.polish or settings.certify
         self.warm_up = rules.sparsity_horizon if settings.warm_up is None else settings.warm_up
         self._first_step = FirstStep(condensed, settings.penalty)
         self._threshold = None
@@ -94,11 +94,10 @@ class AlternatingSearch(HeuristicSearch):
         elif settled.status is not QPStatus.OPTIMAL:
             return Plan(None, HELD_BY[settled.status], settled.rounds)
         else:
-            status = Status.FEASIBLE if self.settings.polish else Status.SETTLED
+            status = Status.FEASIBLE if self._polish else Status.SETTLED
         guess = self._shifted(settled.v)
-        if not self.settings.polish and instance.rest is None:  # at rest, not even a small move
-            plan = Plan(settled.d, status, settled.rounds, guess=guess, remarks=self._remarks(past))
-            return self._certified(plan, instance, state)
+        if not self._polish and instance.rest is None:  # at rest, not even a small move
+            return Plan(settled.d, status, settled.rounds, guess=guess, remarks=self._remarks(past))
         pattern = settled.v != 0.0
         if not self.admissible.allows(pattern, past):  # past moves compete above; here they are gone for good
             pattern = self.admissible.select(

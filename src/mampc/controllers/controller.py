@@ -16,7 +16,7 @@ from mampc.controllers.pattern_solver import PatternSolver
 from mampc.controllers.present import PresentLimits
 from mampc.errors import MampcError
 from mampc.instance import Indices, Instance
-from mampc.patterns import MoveRules
+from mampc.patterns import SAME, MoveRules
 from mampc.problem import Limits, TrackingProblem
 from mampc.qp import QPStatus
 from mampc.qp_daqp import DaqpSolver, active_bounds
@@ -85,13 +85,14 @@ class Controller(ABC):
         for constant in (self._no_violations, self._unknown_violations):
             constant.setflags(write=False)
         self._shape = (problem.control_horizon, model.n_inputs)
+        self._memory = 1
         self._x_shape = (model.n_states,)
         self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
 
     @property
     def memory(self) -> int:
         """How many past inputs the controller looks back on."""
-        return 1
+        return self._memory
 
     def initial_state(self, u_previous: Any = None) -> ControllerState:
         """The state before the first sample.
@@ -144,6 +145,7 @@ class Controller(ABC):
             MampcError: arrays of the wrong shape.
         """
         start = perf_counter()
+        self._check(state)
         x = as_shaped("x", x, self._x_shape)
         constant, previewed = self._reference_shapes
         depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
@@ -178,7 +180,32 @@ class Controller(ABC):
                 planned_from = self._brought_inside(state, present)
                 if planned_from is not state:
                     continue
+                if self._may_rest(instance):  # then nothing is infeasible, and it was the numbers that failed
+                    plan = plan._replace(status=Status.HELD_SOLVER_FAILED)
             return self._decide(plan, instance, state, planned_from, present, start)
+
+    def _check(self, state: ControllerState) -> None:
+        if not isinstance(state, ControllerState) or len(state.inputs) != self._memory:
+            raise MampcError(
+                f"state: expected a ControllerState with {self._memory} past inputs, from `initial_state` or a "
+                f"decision of this controller, received {_described(state)}"
+            )
+
+    def _may_rest(self, instance: Instance) -> bool:
+        """Whether no move at all keeps the hard limits."""
+        condensed = self.condensed
+        moves, inputs = slice(condensed.n_violations, condensed.program.n_simple), condensed.input_rows
+        return all(
+            bool((instance.lower[rows] <= 0).all() and (instance.upper[rows] >= 0).all())
+            for rows in (moves, inputs)
+        )
+
+    def _outside(self, u: Array, present: PresentLimits | None) -> bool:
+        """Whether some input that is not in manual is outside its limits."""
+        low, high = self._u_min, self._u_max
+        if present is not None and not present.crossed:
+            low, high = present.planned_min[0], present.planned_max[0]
+        return bool(((u < low - SAME) | (u > high + SAME)).any())
 
     def _by_hand(self, manual: Any) -> BoolArray | None:
         """Which inputs are in manual, None for no input."""
@@ -239,6 +266,7 @@ class Controller(ABC):
         start: float,
     ) -> Decision:
         moves, status, iterations, lower_bound, guess, inputs, objective, remarks, active = plan
+        held = moves is None or instance is None
         if moves is None or instance is None:
             moves = np.zeros(self.condensed.n_moves)
             objective, lower_bound = np.nan, -np.inf
@@ -255,6 +283,8 @@ class Controller(ABC):
             planned = np.concatenate((planned_from.inputs[-1:], changes)).cumsum(axis=0)[1:]
             low, high = self._range(present)
             inputs = np.minimum(np.maximum(planned, low), high)
+            if held and planned_from is state and self._outside(planned[0], present):
+                remarks = (*remarks, Remark.BACK_INSIDE)
             if instance is None:
                 violations = self._unknown_violations
             elif self.condensed.n_violations:
@@ -312,6 +342,10 @@ class Controller(ABC):
         if solved.moves is None:
             return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.iterations)
         return Plan(solved.moves, Status.OPTIMAL, solved.iterations, None, objective=solved.objective)
+
+
+def _described(state: Any) -> str:
+    return f"one with {len(state.inputs)}" if isinstance(state, ControllerState) else type(state).__name__
 
 
 def _dimensions(values: Any) -> int:

@@ -114,14 +114,12 @@ class HeuristicSearch:
 
     def _certified(self, plan: Plan, instance: Instance, state: ControllerState) -> Plan:
         """The plan with a proven lower bound, where that is asked for."""
-        if self._referee is None:
+        if self._referee is None or plan.objective is None:
             return plan
         proof = self._referee.plan(instance, state)
         bound = proof.objective if proof.lower_bound is None else proof.lower_bound
-        if (
-            plan.objective is None or bound is None
-        ):  # moves off the pattern are not zero: nothing to prove best
-            return plan._replace(lower_bound=bound)
+        if bound is None:
+            return plan
         if plan.status is Status.FEASIBLE and plan.objective - bound <= 10 * TIE * max(
             1e-6, instance.constant
         ):

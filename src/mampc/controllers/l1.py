@@ -68,7 +68,8 @@ class L1Search(HeuristicSearch):
         H[v + n :, v + n :] = CURVATURE * np.diag(condensed.H).mean() * np.eye(n)
         none, eye = np.zeros((n, v)), np.eye(n)
         A = np.block([[full.A, np.zeros((len(full.A), n))], [none, -eye, eye], [none, eye, eye]])
-        self._program = DaqpSolver(QuadraticProgram(H, A, full.n_simple))
+        # Next to that little curvature of t moves are small numbers.
+        self._program = DaqpSolver(QuadraticProgram(H, A, full.n_simple), tolerance=1e-9 * np.sqrt(CURVATURE))
 
     def _propose(
         self, instance: Instance, past: Past, guess: Array | None, best: Incumbent

@@ -99,7 +99,7 @@ class MAMPC(Controller):
                 f"violation_margin: expected values of at least 0, received {violation_margin!r}"
             )
         self._margin = margin if on_limit_violation == "ignore_budget" else None
-        self.rules = rules
+        self.rules, self._memory = rules, rules.memory
         self.method = method_of(method, settings)
         self._admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
         self._check_sizes()
@@ -113,17 +113,8 @@ class MAMPC(Controller):
             if (size > most).any():
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
-    @property
-    def memory(self) -> int:
-        return self.rules.memory
-
     def _planned_from(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
         """A pattern says which inputs move, so none may be outside its limits when it is chosen."""
-        if len(state.inputs) != self.rules.memory:
-            raise MampcError(
-                f"state: expected one of this controller, with {self.rules.memory} past inputs, "
-                f"received {len(state.inputs)}"
-            )
         if present is not None and not present.crossed:
             u = state.inputs[-1]
             if ((u >= present.planned_min[0]) & (u <= present.planned_max[0])).all():

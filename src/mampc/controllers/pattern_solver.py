@@ -226,9 +226,10 @@ def without_rounding(condensed: CondensedQP, instance: Instance, moves: Array) -
     limits, u = condensed.problem.limits, instance.u_previous
     inputs = u + moves.reshape(-1, len(u)).cumsum(axis=0)
     inputs = np.concatenate((u[None], np.minimum(np.maximum(inputs, limits.u_min), limits.u_max)))
-    changes: Array = (inputs[1:] - inputs[:-1]).ravel()
+    changes: Array = inputs[1:] - inputs[:-1]
+    changes[:, ~moves.reshape(changes.shape).any(axis=0)] = 0.0  # in manual, wherever that is
     changes[np.abs(changes) <= SAME] = 0.0
-    return changes
+    return changes.ravel()
 
 
 def _apart(lower: Array, upper: Array, at: int, size: float, value: float) -> list[tuple[Array, Array]]:
