@@ -180,6 +180,59 @@ def spoilt(healthy, faults, last):
     return given, np.array(read)
 
 
+class Believed:
+    """What is believed of the inputs, word for word.
+
+    Attributes:
+        applied: inputs that count as applied, oldest first.
+        commands: inputs decided, oldest first.
+    """
+
+    def __init__(self, applied, limits):
+        self.applied, self._remembered = [row.copy() for row in applied], len(applied)
+        self.commands = [applied[0].copy() for _ in range(12)] + [row.copy() for row in applied]
+        self._last, self._answers = applied[-1].copy(), [(0, 0.0)] * len(applied[0])
+        self._apart, self._limits = limits.u_max - limits.u_min, limits
+
+    def decided(self, u):
+        self.applied.append(u.copy())
+        self.commands.append(u.copy())
+
+    def told(self, told, manual):
+        for i, value in enumerate(told):
+            by_hand, apart = manual is not None and manual[i], self._apart[i]
+            beyond = 100.0 * apart if apart > 0 else np.inf
+            low, high = self._limits.u_min[i] - beyond, self._limits.u_max[i] + beyond
+            if abs(value) < 1e12 and low < value < high:
+                tolerance = (0.01 * apart if np.isfinite(apart) else 1e-6) * (0.1 if by_hand else 1.0)
+                answer = self._answer(i, value, tolerance)
+                if answer is None:
+                    self.applied[-1][i] = value
+                elif answer not in (self._answers[i], (0, 0.0)):
+                    for age in range(1, 1 + min(self._remembered, 12)):
+                        self.applied[-age][i] = self.commands[-age][i]
+                self._last[i], self._answers[i] = value, answer or (0, 0.0)
+            if by_hand:
+                for row in self.commands[-12:]:
+                    row[i] = self.applied[-1][i]
+                self._answers[i] = 0, 0.0
+
+    def _answer(self, i, value, tolerance):
+        """Samples by which the input is late, and the offset of its reading; None where it did not obey."""
+        commands, last, (late, offset) = [row[i] for row in self.commands], self._last[i], self._answers[i]
+        if (late or offset) and abs(value - (commands[-1 - late] + offset)) <= tolerance:
+            return late, offset
+        if changed := abs(value - last) > tolerance:
+            for late in range(11):
+                if max(abs(last - commands[-2 - late]), abs(value - commands[-1 - late])) <= tolerance:
+                    return late, 0.0
+        if abs(value - commands[-1]) <= tolerance:
+            return 0, 0.0
+        if changed and abs((value - last) - (commands[-1] - commands[-2])) <= tolerance:
+            return 0, value - commands[-1]
+        return None
+
+
 # Limits told at run time: for each of the five how (None: not at all) and numbers relative to the operating point.
 SHAPES = st.sampled_from([None, None, None, "scalar", "signals", "rows"])
 NEAR = st.one_of(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), NUMBERS)

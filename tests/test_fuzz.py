@@ -52,15 +52,6 @@ def is_usable(values):
     return np.abs(np.nan_to_num(read(values), nan=np.inf)) < LARGEST
 
 
-def believable(applied, decided, limits):
-    """Which applied inputs count: those that some actuator may have reached, and that are not the decided ones."""
-    apart = limits.u_max - limits.u_min
-    beyond = np.where(apart > 0, 100.0 * apart, LARGEST)
-    near = (applied > limits.u_min - beyond) & (applied < limits.u_max + beyond) & is_usable(applied)
-    applied = np.where(near, applied, decided)
-    return np.abs(applied - decided) > np.where(np.isfinite(apart), 1e-3 * apart, 1e-6)
-
-
 def same_to_the_bit(a, b):
     return a.status is b.status and all(
         np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
@@ -77,11 +68,16 @@ class FaultyLoop(RuleBasedStateMachine):
         self.rng, self.regulator = np.random.default_rng(seed), loop.build()
         self.scale = np.abs(self.regulator.estimator.model.C).max()
         self.state = self.regulator.initial_state(None, self.model.y_op if at_rest else None)
-        self.history = [row.copy() for row in self.state.controller.inputs]
+        self.believed = fuzzing.Believed(self.state.controller.inputs, self.problem.limits)
         self.x = np.zeros(self.model.n_states)
         self.y_last, self.v_last = self.model.y_op, self.model.v_op
         self.reference, self.present, self.manual = self.model.y_op, None, None
         self.held = self.fresh = False
+
+    @property
+    def history(self):
+        """The inputs that count as applied, oldest first."""
+        return self.believed.applied
 
     # What stays until it changes
 
@@ -195,7 +191,7 @@ class FaultyLoop(RuleBasedStateMachine):
         if applied is not None:
             before = self.history[-2] if len(self.history) > 1 else decided
             u_applied, told = fuzzing.spoilt(decided, applied, before)
-            self.history[-1] = np.where(believable(told, decided, self.problem.limits), told, decided)
+            self.believed.told(told, self.manual)
         arguments = {
             "u_applied": u_applied, "measured_disturbance": v, "limits": self.present, "manual": self.manual
         }  # fmt: skip
@@ -215,7 +211,9 @@ class FaultyLoop(RuleBasedStateMachine):
         self.check(decision)
         self.check_belief(decision, y, v)
         self.state, self.y_last = decision.state, read(y)
-        self.history.append(decision.u)
+        remembered = decision.state.controller.inputs
+        self.believed.decided(decision.u)
+        np.testing.assert_array_equal(remembered, self.history[-len(remembered) :])
         self.sound = True
         return decision
 

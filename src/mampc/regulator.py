@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from mampc.actuators import LATEST, Actuators
 from mampc.arrays import LARGEST, Array, as_shaped, as_vector, as_whole, is_usable
 from mampc.controllers.controller import Controller
-from mampc.controllers.decision import ControllerState, Decision
+from mampc.controllers.decision import Decision
 from mampc.errors import MampcError
 from mampc.estimation import KalmanFilter
 from mampc.lti import StateSpace
@@ -18,9 +19,6 @@ from mampc.problem import Limits
 from mampc.qp_daqp import active_flags
 from mampc.regulator_state import RegulatorState
 from mampc.sensors import SensorChecks, newly_stuck
-
-NEAR = 1e-3  # times the range of an input: position feedback is no more exact
-ABSURD = 100.0  # times the range of an input: no actuator is that far outside
 
 
 class Regulator:
@@ -32,9 +30,9 @@ class Regulator:
         sensors: when a measurement is believed; default `SensorChecks()`.
         max_blind_steps: samples in a row that inputs are still planned, on predictions, though no output at
             all is believed; from then on they are held until one is. 0 holds at once.
-        applied_tolerance: an applied input this near to the decided one is the decided one: position feedback
-            is never exact. In input units, a scalar or (m,); default a thousandth of the input's range, or
-            1e-6 where that is not finite.
+        applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
+            position feedback are never exact. In input units, a scalar or (m,); default a hundredth of the
+            input's range, or 1e-6 where that is not finite.
 
     Raises:
         MampcError: arguments of other types, or an estimator of a model of other dimensions.
@@ -58,20 +56,16 @@ class Regulator:
         model = controller.problem.model
         self.controller = controller
         self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
-        self._y_shape = (model.n_outputs,)
+        self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
         self.estimator = KalmanFilter.offset_free(model) if estimator is None else estimator
         self._sensors = (SensorChecks() if sensors is None else sensors).fitted(controller.problem)
         self._v_shape = (model.n_disturbances,)
-        limits = controller.problem.limits
-        apart = limits.u_max - limits.u_min
-        self._applied_tolerance = np.where(np.isfinite(apart), NEAR * apart, 1e-6)
+        tolerance = None
         if applied_tolerance is not None:
-            self._applied_tolerance = as_vector("applied_tolerance", applied_tolerance, model.n_inputs)
-        if (self._applied_tolerance < 0).any():
-            raise MampcError(f"applied_tolerance: expected at least 0, received {applied_tolerance!r}")
-        beyond = np.where(apart > 0, ABSURD * apart, LARGEST)
-        self._u_low = np.maximum(limits.u_min - beyond, -LARGEST)
-        self._u_high = np.minimum(limits.u_max + beyond, LARGEST)
+            tolerance = as_vector("applied_tolerance", applied_tolerance, model.n_inputs)
+            if (tolerance < 0).any():
+                raise MampcError(f"applied_tolerance: expected at least 0, received {applied_tolerance!r}")
+        self._actuators = Actuators(controller.problem.limits, tolerance)
         expected, received = _sizes(model), _sizes(self.estimator.model)
         if received != expected:
             raise MampcError(f"estimator: expected a model with {expected}, received {received}")
@@ -95,7 +89,8 @@ class Regulator:
         if measured_disturbance is not None:
             v = as_vector("measured_disturbance", measured_disturbance, len(v))
         estimate = self.estimator.initial(controller.inputs[-1], y, v)
-        return RegulatorState(controller, estimate, v, self._sensors.initial())
+        actuators = self._actuators.initial(controller.inputs)
+        return RegulatorState(controller, estimate, v, self._sensors.initial(), actuators)
 
     def state_from_json(self, text: str) -> RegulatorState:
         """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
@@ -111,6 +106,11 @@ class Regulator:
         if not active_flags(state.controller.active):
             raise MampcError(
                 f"state: expected flags at controller.active, received {state.controller.active}"
+            )
+        late = state.actuators.late
+        if not np.isin(late, np.arange(LATEST + 1)).all():
+            raise MampcError(
+                f"state: expected whole numbers up to {LATEST} at actuators.late, received {late}"
             )
         return state
 
@@ -136,8 +136,8 @@ class Regulator:
             u_applied: what the plant really got since the last step, shape (m,), if not what was decided:
                 a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided, and so do
                 a value within `applied_tolerance` and one a hundred times further outside its limits than these
-                are apart. Tell nothing (not-a-number) while an actuator is only on its way: what is told is
-                where plans start from, and a move not made is not counted.
+                are apart. What an actuator does later than decided, by up to 10 samples, counts as decided as
+                soon as it shows (see docs/safety.md); so does what is read with a constant offset.
             measured_disturbance: now, shape (d,), in engineering units; predicted to stay as it is.
                 Left out or not usable, the last one holds on.
             limits, manual: see `Controller.step`. Tell `u_applied` while an input is in manual; when it is
@@ -148,9 +148,13 @@ class Regulator:
         """
         start = perf_counter()
         y = as_shaped("y", y, self._y_shape)
-        memory, v_last = state.controller, state.measured_disturbance
+        memory, actuators, v_last = state.controller, state.actuators, state.measured_disturbance
         if u_applied is not None:
-            memory = self._applied(memory, u_applied)
+            told = as_shaped("u_applied", u_applied, self._u_shape)
+            by_hand = None if manual is None else as_shaped("manual", manual, self._u_shape) != 0.0
+            inputs, actuators = self._actuators.applied(actuators, memory.inputs, told, by_hand)
+            if inputs is not memory.inputs:
+                memory = replace(memory, inputs=inputs)
         u_previous = memory.inputs[-1]
         v = v_last
         if measured_disturbance is not None:
@@ -189,19 +193,9 @@ class Regulator:
         )
         return replace(
             decision,
-            state=RegulatorState(decision.state, estimate, v, sensors),
+            state=RegulatorState(decision.state, estimate, v, sensors, actuators.then(decision.u)),
             ignored_outputs=ignored,
             solve_time=perf_counter() - start,
-        )
-
-    def _applied(self, memory: ControllerState, u_applied: Any) -> ControllerState:
-        """The memory with the latest inputs put right, where what is told differs and can be believed."""
-        decided = memory.inputs[-1]
-        told = as_shaped("u_applied", u_applied, decided.shape)
-        known = (told > self._u_low) & (told < self._u_high)
-        known[known] &= (np.abs(told - decided) > self._applied_tolerance)[known]
-        return replace(
-            memory, inputs=np.concatenate([memory.inputs[:-1], np.where(known, told, decided)[None]])
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mampc.actuators import ActuatorState
 from mampc.arrays import Array, as_whole
 from mampc.controllers.decision import ControllerState
 from mampc.errors import MampcError
@@ -26,12 +27,14 @@ class RegulatorState:
         estimate: state and disturbances, corrected with the last measurement.
         measured_disturbance: as last told, shape (d,).
         sensors: what the sensor checks remember.
+        actuators: what is remembered of the actuators.
     """
 
     controller: ControllerState
     estimate: Estimate
     measured_disturbance: Array
     sensors: SensorState
+    actuators: ActuatorState
 
     def to_json(self) -> str:
         """The state as JSON text; `Regulator.state_from_json` gives the same numbers back."""
@@ -45,10 +48,12 @@ class RegulatorState:
             if content.pop("format") != FORMAT:
                 raise MampcError(f"state: expected the format {FORMAT!r}")
             numbers = {part: _numbers(part, values) for part, values in content.items()}
+            actuators = numbers.pop("actuators")
             return cls(
                 ControllerState(**numbers.pop("controller")),
                 Estimate(**numbers.pop("estimate")),
                 sensors=SensorState(**numbers.pop("sensors")),
+                actuators=ActuatorState(tuple(actuators.pop("commands")), **actuators),
                 **numbers,
             )
         except MampcError:
@@ -61,7 +66,10 @@ class RegulatorState:
 
     def shapes(self) -> dict[str, tuple[int, ...] | None]:
         """The shape of every array, by its place; None where there is none."""
-        parts = {"controller": self.controller, "estimate": self.estimate, "sensors": self.sensors}
+        parts = {
+            "controller": self.controller, "estimate": self.estimate, "sensors": self.sensors,
+            "actuators": self.actuators,
+        }  # fmt: skip
         places = {
             f"{part}.{name}": value for part, held in parts.items() for name, value in vars(held).items()
         }
