@@ -185,6 +185,12 @@ def test_a_measured_rest_that_cannot_be_is_refused(y):
     refuses(mampc.Regulator(mampc.MPC(tank_problem())).initial_state, [50.0, 50.0], y)
 
 
+@pytest.mark.parametrize("number", [10**400, 16**5000, -(16**5000)], ids=["1e400", "16^5000", "-16^5000"])
+@pytest.mark.parametrize("option", ["move_weight", "tail_horizon", "prediction_horizon"])
+def test_numbers_of_very_many_digits_are_refused(option, number):
+    refuses(tank_problem, **{option: number})
+
+
 def test_importing_mampc_leaves_heavy_modules_out():
     heavy = ["scipy.signal", "scipy.integrate", "matplotlib", "pandas", "plotly", "typer"]
     code = f"import sys, mampc; print([name for name in {heavy} if name in sys.modules])"
