@@ -9,9 +9,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mampc.errors import MampcError
-from mampc.files import PARTIAL, written_whole
+from mampc.files import PARTIAL, read_text, written_whole
 
 MANIFEST = ".mampc-files"  # what a run wrote, so that the next can clear it away
+MANIFEST_LIMIT = 2**24  # bytes
 
 
 class ResultFolder:
@@ -75,8 +76,8 @@ class ResultFolder:
     def _of_last_run(self) -> set[str]:
         """The files that the last run put here, as far as its list can be believed."""
         try:
-            names = (self.path / MANIFEST).read_text(encoding="utf-8").splitlines()
-        except OSError:
+            names = read_text(self.path / MANIFEST, MANIFEST_LIMIT, "list of files").splitlines()
+        except MampcError:
             return set()
         root = self.path.resolve()
         return {name for name in names if name and (self.path / name).resolve().is_relative_to(root)}
