@@ -22,8 +22,8 @@ from mampc.errors import MampcError
 from mampc.files import read_text, written_whole
 from mampc.names import Names, require_count
 
-MODEL_FILE_LIMIT = 4 * 2**20  # bytes; the largest model fits with room to spare
-MOST_SIGNALS = 200  # states of a model in a file, and inputs, and outputs; a step takes seconds far beyond it
+MODEL_FILE_LIMIT = 8 * 2**20  # bytes; the largest model fits with room to spare
+MOST_SIGNALS = 200  # states of a model in a file, and inputs, and outputs; far beyond it, a study takes hours
 
 
 @dataclass(frozen=True, eq=False)
