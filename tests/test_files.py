@@ -9,6 +9,7 @@ import pytest
 
 import mampc
 from mampc.csv_table import CSV_FILE_LIMIT, CSVTable
+from mampc.files import written_whole
 from mampc.lti import MOST_SIGNALS
 from mampc.report.folder import MANIFEST, ResultFolder
 
@@ -35,6 +36,18 @@ def test_a_pipe_in_the_place_of_a_list_of_files_stops_nothing(tmp_path):
     os.mkfifo(tmp_path / MANIFEST)
     ResultFolder(tmp_path, last="summary.json").place("a.csv")
     assert (tmp_path / MANIFEST).read_text() == "a.csv\n"
+
+
+def test_names_too_long_for_a_file_are_refused_and_not_listed(tmp_path):
+    folder = ResultFolder(tmp_path, last="summary.json")
+    with pytest.raises(mampc.MampcError, match="at most 200 bytes"):
+        folder.place(f"figures/{'a' * 201}.svg")
+    assert not (tmp_path / MANIFEST).exists()
+    with (
+        pytest.raises(mampc.MampcError, match="can be written"),
+        written_whole(tmp_path / ("a" * 300)) as file,
+    ):
+        file.write_text("")
 
 
 def test_a_record_is_bounded_and_takes_little_more_memory_than_its_file(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from mampc.files import PARTIAL, read_text, written_whole
 
 MANIFEST = ".mampc-files"  # what a run wrote, so that the next can clear it away
 MANIFEST_LIMIT = 2**24  # bytes
+LONGEST_NAME = 200  # bytes; file systems allow 255, and the name of a file not yet whole is longer
 
 
 class ResultFolder:
@@ -56,6 +57,11 @@ class ResultFolder:
 
     def place(self, name: str) -> Path:
         """Where the file `name` goes; it is listed, so that the next run can clear it away."""
+        if len(os.fsencode(Path(name).name)) > LONGEST_NAME:
+            raise MampcError(
+                f"{name}: expected a file name of at most {LONGEST_NAME} bytes; "
+                "shorten the names of scenarios and signals"
+            )
         if name not in self._names:
             self._names.append(name)
             with written_whole(self.path / MANIFEST) as unfinished:
