@@ -86,6 +86,13 @@ def test_a_tracking_problem_that_makes_no_sense_is_refused(options):
     refuses(tank_problem, **options)
 
 
+def test_a_tracking_problem_too_large_for_the_memory_is_refused():
+    many_outputs = mampc.StateSpace([[0.5]], [[1.0]], np.ones((60, 1)), None, 1.0)
+    refuses(mampc.TrackingProblem, many_outputs, prediction_horizon=100, control_horizon=5)
+    many_inputs = mampc.StateSpace([[0.5]], np.ones((1, 60)), [[1.0]], None, 1.0)
+    refuses(mampc.TrackingProblem, many_inputs, prediction_horizon=100, control_horizon=50)
+
+
 @pytest.mark.parametrize("model", [None, "tank", np.eye(2), mampc.linearise(mampc.plants.QuadrupleTank())])
 def test_a_tracking_problem_wants_a_discrete_model(model):
     refuses(mampc.TrackingProblem, model, prediction_horizon=10, control_horizon=5)
