@@ -86,6 +86,13 @@ def test_a_tracking_problem_that_makes_no_sense_is_refused(options):
     refuses(tank_problem, **options)
 
 
+def test_a_tracking_problem_too_large_for_the_memory_is_refused():
+    many_outputs = mampc.StateSpace([[0.5]], [[1.0]], np.ones((60, 1)), None, 1.0)
+    refuses(mampc.TrackingProblem, many_outputs, prediction_horizon=100, control_horizon=5)
+    many_inputs = mampc.StateSpace([[0.5]], np.ones((1, 60)), [[1.0]], None, 1.0)
+    refuses(mampc.TrackingProblem, many_inputs, prediction_horizon=100, control_horizon=50)
+
+
 @pytest.mark.parametrize("model", [None, "tank", np.eye(2), mampc.linearise(mampc.plants.QuadrupleTank())])
 def test_a_tracking_problem_wants_a_discrete_model(model):
     refuses(mampc.TrackingProblem, model, prediction_horizon=10, control_horizon=5)
@@ -198,6 +205,12 @@ def test_inputs_applied_so_far_that_cannot_be_are_refused(u_previous):
 @pytest.mark.parametrize("y", [[1.0], [1.0, NAN], "level", np.ones((2, 2))], ids=str)
 def test_a_measured_rest_that_cannot_be_is_refused(y):
     refuses(mampc.Regulator(mampc.MPC(tank_problem())).initial_state, [50.0, 50.0], y)
+
+
+@pytest.mark.parametrize("number", [10**400, 16**5000, -(16**5000)], ids=["1e400", "16^5000", "-16^5000"])
+@pytest.mark.parametrize("option", ["move_weight", "tail_horizon", "prediction_horizon"])
+def test_numbers_of_very_many_digits_are_refused(option, number):
+    refuses(tank_problem, **{option: number})
 
 
 def test_importing_mampc_leaves_heavy_modules_out():

@@ -123,7 +123,10 @@ def test_a_given_step_needs_no_time_column_and_wins_over_one(tmp_path):
         ("time,u,y,u\n0,1,2,3\n", "expected one column 'u', received columns"),
         ("u,y\n1,2\n3,4\n", "expected one column 'time', .* pass dt"),
         ("time,u,y\n0,1,2\n1,two,3\n", "expected a number in row 3, column 'u', received 'two'"),
-        ("time,u,y\n0,1,2\n\n\n1,2,\n", "expected a number in row 5, column 'y', received ''"),
+        (
+            "time,u,y\n0,1,2\n\n\n1,2,\n",
+            "expected a number in row 5, column 'y', received nothing; fill the gap",
+        ),
         ("time,u,y\n0,1,nan\n1,2,3\n", "expected a number in row 2, column 'y', received 'nan'"),
         ("time,u,y\n0,1,2\n1,inf,3\n", "expected a number in row 3, column 'u', received 'inf'"),
         ("time,u,y\n0,1,2\n1,2,3\n3,4,5\n", "expected an evenly increasing time column"),
@@ -131,6 +134,9 @@ def test_a_given_step_needs_no_time_column_and_wins_over_one(tmp_path):
         ("time,u,y\n2,1,2\n1,2,3\n", "expected an evenly increasing time column"),
         ("time,u,y\n0,1,2\n", "expected an evenly increasing time column"),
         ("noon,u,y\n0,1,2\n", "expected one column 'time'"),
+        ("time;u;y\n0;1;2\n1;2;3\n", "expected fields separated by commas, received semicolons"),
+        ("time;u;y\n0,0;1,5;2,5\n", "commas between fields and points in numbers"),
+        ("time\tu\ty\n0\t1\t2\n", "expected fields separated by commas, received tabs"),
     ],
 )
 def test_a_file_that_is_no_record_is_refused_with_the_place(tmp_path, text, message):

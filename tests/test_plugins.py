@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import mampc
-from mampc.study import load_study, run_study
+from mampc.study import load_study, parse_study, run_study
 
 DOCS = Path(__file__).parents[1] / "docs" / "plants.md"
 STUDY = """
@@ -75,6 +75,35 @@ def test_code_of_a_study_from_elsewhere_needs_trust(folder, tmp_path_factory, mo
     with pytest.raises(mampc.StudyError, match="--trust"):
         run_study(load_study(folder / "study.toml"))
     assert run_study(load_study(folder / "study.toml", trust=True)).runs
+
+
+def test_text_is_trusted_only_when_asked(folder):
+    text = (folder / "study.toml").read_text()
+    with pytest.raises(mampc.StudyError, match="trust=True"):
+        run_study(parse_study(text))
+    assert run_study(parse_study(text, trust=True)).runs
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("def (", "imported, received SyntaxError: invalid syntax"),
+        ("raise SystemExit(0)", "imported, received SystemExit: 0, in line 1 of"),
+        ("import no_such_module", "imported, received: No module named 'no_such_module'"),
+        (
+            "class Plant:\n  def __init__(self): 1 / 0",
+            "can be made, received ZeroDivisionError: .* in line 2 of",
+        ),
+        ("class Plant:\n  def __init__(self): exit(0)", "can be made, received SystemExit"),
+        ("class Plant:\n  names = property(lambda self: 1 / 0)", "can be made, received ZeroDivisionError"),
+    ],
+)
+def test_plants_whose_code_fails_are_refused_with_the_place(code, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / f"wrong_{tmp_path.name}.py").write_text(code)
+    (tmp_path / "study.toml").write_text(STUDY.format(kind=f"wrong_{tmp_path.name}:Plant"))
+    with pytest.raises(mampc.StudyError, match=f"plant.kind: .*{expected}"):
+        run_study(load_study("study.toml"))
 
 
 @pytest.mark.parametrize(

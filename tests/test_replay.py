@@ -105,6 +105,35 @@ def test_a_replay_finds_the_first_decision_that_differs():
     assert "sample 23 (t = 230 s)" in str(found)
 
 
+def test_a_replay_finds_what_was_changed_in_the_words_of_a_decision_and_in_its_time(tmp_path):
+    regulator = tight_regulator("exact")
+    run = mampc.simulate(TANK, regulator, tank_reference(40), noise=0.1)
+    state = regulator.initial_state(run.u_initial, TANK.output(TANK.steady_state()))
+    run.to_csv(tmp_path / "run.csv")
+    header, *rows = (line.split(",") for line in (tmp_path / "run.csv").read_text().splitlines())
+
+    def replayed(column, value):
+        changed = [list(row) for row in rows]
+        changed[17][header.index(column)] = value
+        (tmp_path / "run.csv").write_text("\n".join(",".join(row) for row in [header, *changed]))
+        return mampc.replay(regulator, state, mampc.Recording.from_csv(tmp_path / "run.csv", TANK.names))
+
+    assert replayed("time", rows[17][0]) is None
+    for column, value, quantity, now in (
+        ("time", "171.0", "the time", "170.0"),
+        ("remarks", "back_inside", "the remarks", "none"),
+        ("ignored", "y1:missing", "the ignored outputs", "none"),
+    ):
+        found = replayed(column, value)
+        assert (found.sample, found.quantity, found.replayed) == (17, quantity, now)
+
+
+def test_a_run_that_is_not_there_is_refused_before_anything_is_identified(tmp_path):
+    outcome = CliRunner().invoke(app, ["replay", str(tmp_path / "noisy_mpc.csv"), "-s", "quadruple-tank"])
+    assert "where there is none" in str(outcome.exception)
+    assert "identifying" not in outcome.output
+
+
 SHORT = template().replace("steps = 145", "steps = 30").replace("skip = 15", "skip = 5")
 
 

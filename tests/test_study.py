@@ -97,6 +97,49 @@ def test_text_that_is_not_toml_is_refused():
         parse_study("name = ")
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong", "expected"),
+    [
+        ("steps = 145", "steps = " + "9" * 5000, "lines of at most 2000 characters"),
+        ("steps = 145", "steps = 0x" + "f" * 1000, "steps"),
+        ("penalty = 10.0", "penalty = 0x" + "f" * 1000, "penalty: expected a finite number"),
+        ("amplitude = 25.0", "amplitude = 0x" + "f" * 1000, "amplitude"),
+        ("\nseed = 0", "\nseed = 0x" + "f" * 1000, "seed"),
+        ("at = 5,", "at = 1000000000000,", "changes[0].at"),
+        ('name = "MPC"', f'name = "{"中" * 80}"', "controllers[0].name: expected a name of at most 80 bytes"),
+        ('name = "noisy"', f'name = "{"中" * 80}"', "scenarios[1].name: expected a name of at most 80 bytes"),
+        ("[plant]", "a" + ".a" * 2000 + " = 1\n[plant]", "lines of at most 2000 characters"),
+        ("[plant]", "x = " + "[\n" * 5000 + "\n[plant]", "expected TOML"),
+        ("[plant]", "#\n" * 2**17 + "\n[plant]", "at most 262144 characters"),
+    ],
+)
+def test_numbers_keys_and_names_beyond_all_bounds_are_refused_in_short(right, wrong, expected):
+    assert right in template()
+    with pytest.raises(mampc.StudyError) as complaint:
+        parse_study(template().replace(right, wrong, 1))
+    assert expected in str(complaint.value)
+    assert len(str(complaint.value)) < 1000
+
+
+def test_of_many_complaints_the_first_are_shown():
+    text = "\n".join(f"key{i} = 1" for i in range(5000)) + "\n" + template()
+    with pytest.raises(mampc.StudyError, match=r"key19: unknown key.*\n.*more like these") as complaint:
+        parse_study(text)
+    assert len(str(complaint.value).splitlines()) == 22
+
+
+def test_a_byte_order_mark_does_not_matter(tmp_path):
+    (tmp_path / "study.toml").write_text(template(), encoding="utf-8-sig")
+    assert load_study(tmp_path / "study.toml").model_dump() == parse_study(template()).model_dump()
+
+
+def test_a_model_file_with_an_impossible_name_is_refused():
+    before, after = SHORT.index("[identification]"), SHORT.index("[problem]")
+    text = SHORT[:before] + '[model]\nfile = "a\\u0000b"\n\n' + SHORT[after:]
+    with pytest.raises(mampc.StudyError, match=r"model\.file: expected the path of a file"):
+        run_study(parse_study(text))
+
+
 def test_a_file_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(mampc.StudyError, match="quadruple-tank"):
         load_study(tmp_path / "none.toml")

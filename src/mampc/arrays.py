@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from mampc.errors import MampcError
+from mampc.errors import MampcError, shown
 
 Array: TypeAlias = npt.NDArray[np.floating[Any]]  # float64 throughout
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
@@ -32,7 +33,7 @@ def as_read(name: str, value: Any) -> Array:
             value = np.ma.filled(value.astype(np.float64), np.nan)
         array: Array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise MampcError(f"{name}: expected numbers, received {_short(value)}") from None
+        raise MampcError(f"{name}: expected numbers, received {shown(value)}") from None
     return array
 
 
@@ -54,7 +55,7 @@ def as_array(name: str, value: Any) -> Array:
             raise TypeError
         return np.ascontiguousarray(array, dtype=np.float64).reshape(array.shape)
     except (TypeError, ValueError):
-        raise MampcError(f"{name}: expected real numbers, received {_short(value)}") from None
+        raise MampcError(f"{name}: expected real numbers, received {shown(value)}") from None
 
 
 def as_matrix(name: str, value: Any, rows: int | None = None, columns: int | None = None) -> Array:
@@ -91,7 +92,7 @@ def as_limit(name: str, value: Any, size: int, unlimited: float) -> Array:
     if array.shape != (size,):
         raise MampcError(f"{name}: expected None, a scalar or {size} values, received shape {array.shape}")
     if np.isnan(array).any() or (array == -unlimited).any():
-        raise MampcError(f"{name}: expected numbers or {unlimited}, received {_short(value)}")
+        raise MampcError(f"{name}: expected numbers or {unlimited}, received {shown(value)}")
     return array
 
 
@@ -108,7 +109,7 @@ def as_weight(name: str, value: Any, size: int) -> Array:
             f"received shape {array.shape}"
         )
     if not np.allclose(array, array.T, rtol=1e-10, atol=0.0):
-        raise MampcError(f"{name}: expected a symmetric matrix, received {_short(value)}")
+        raise MampcError(f"{name}: expected a symmetric matrix, received {shown(value)}")
     array = (array + array.T) / 2
     eigenvalues = np.linalg.eigvalsh(array)
     if eigenvalues[0] < -1e-12 * max(1.0, eigenvalues[-1]):
@@ -123,24 +124,29 @@ def as_whole(name: str, value: Any, minimum: int, maximum: int | None = None) ->
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or value < minimum or (maximum is not None and value > maximum):
         upto = "" if maximum is None else f" and at most {maximum}"
-        raise MampcError(f"{name}: expected a whole number of at least {minimum}{upto}, received {value!r}")
+        raise MampcError(
+            f"{name}: expected a whole number of at least {minimum}{upto}, received {shown(value)}"
+        )
     return int(value)
 
 
 def as_flag(name: str, value: Any) -> bool:
     """True or false; raises `MampcError` for anything else, such as the text "no"."""
     if not isinstance(value, bool):
-        raise MampcError(f"{name}: expected true or false, received {value!r}")
+        raise MampcError(f"{name}: expected true or false, received {shown(value)}")
     return value
 
 
 def as_number(name: str, value: Any, minimum: float = -np.inf, *, exclusive: bool = False) -> float:
     """A finite number of at least `minimum` (above it when `exclusive`); raises `MampcError`."""
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not number or not np.isfinite(value) or value < minimum or (exclusive and value == minimum):
+    number = np.nan
+    if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
+        with suppress(OverflowError):  # a whole number may be larger than any float
+            number = float(value)
+    if not np.isfinite(number) or number < minimum or (exclusive and number == minimum):
         bound = "" if minimum == -np.inf else f" {'above' if exclusive else 'of at least'} {minimum:g}"
-        raise MampcError(f"{name}: expected a finite number{bound}, received {value!r}")
-    return float(value)
+        raise MampcError(f"{name}: expected a finite number{bound}, received {shown(value)}")
+    return number
 
 
 def require_finite(name: str, array: Array) -> Array:
@@ -149,8 +155,3 @@ def require_finite(name: str, array: Array) -> Array:
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise MampcError(f"{name}: expected finite numbers, received {array[place]} at {list(place)}")
     return array
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

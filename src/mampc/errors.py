@@ -1,5 +1,9 @@
 """What mampc raises: every message states what was expected and what came."""
 
+from __future__ import annotations
+
+from typing import Any
+
 
 class MampcError(ValueError):
     """An argument, file or model that mampc cannot work with."""
@@ -7,3 +11,12 @@ class MampcError(ValueError):
 
 class StudyError(MampcError):
     """A study file with a wrong key, type, value or unit; the message names each place."""
+
+
+def shown(value: Any, length: int = 60) -> str:
+    """A value as messages show it: cut where it is long, and never a reason to fail."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a number of too many digits, a list too deep in lists
+        text = f"{type(value).__name__} too long to be shown"
+    return text if len(text) <= length else text[: length - 3] + "..."

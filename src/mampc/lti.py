@@ -19,10 +19,11 @@ import numpy as np
 
 from mampc.arrays import Array, ComplexArray, as_array, as_matrix, as_number, as_vector
 from mampc.errors import MampcError
-from mampc.files import written_whole
+from mampc.files import read_text, written_whole
 from mampc.names import Names, require_count
 
-MODEL_FILE_LIMIT = 16 * 2**20  # bytes; a 1000-state model fits with room to spare
+MODEL_FILE_LIMIT = 8 * 2**20  # bytes; the largest model fits with room to spare
+MOST_SIGNALS = 200  # states of a model in a file, and inputs, and outputs; far beyond it, a study takes hours
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +237,12 @@ class StateSpace:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the model as JSON, whole or not at all; `load` gives the same numbers back."""
+        """Write the model as JSON, whole or not at all; `load` gives the same numbers back.
+
+        Raises:
+            MampcError: a model larger than `load` takes, or a file that cannot be written.
+        """
+        self._require_moderate(path)
         arrays = ("A", "B", "C", "D", "u_op", "y_op", "v_op")
         content = {
             "format": "mampc-model-1",
@@ -251,24 +257,31 @@ class StateSpace:
     def load(cls, path: str | Path) -> StateSpace:
         """Read a model written by `save`; raises `MampcError` for anything else."""
         try:
-            size = Path(path).stat().st_size
-            if size > MODEL_FILE_LIMIT:
-                raise MampcError(f"{path}: expected at most {MODEL_FILE_LIMIT} bytes, received {size}")
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
+            content = json.loads(read_text(path, MODEL_FILE_LIMIT, "mampc model file"))
         except MampcError:
             raise
-        except (OSError, ValueError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             raise MampcError(f"{path}: expected a mampc model file, received: {error}") from None
         if not isinstance(content, dict) or content.get("format") != "mampc-model-1":
             raise MampcError(f"{path}: expected a model file with format 'mampc-model-1'")
         try:
             names = Names(**{k: tuple(v) for k, v in content["names"].items()})
             matrices = {k: content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")}
-            return cls(**matrices, names=names, v_op=content.get("v_op", 0.0))
+            model = cls(**matrices, names=names, v_op=content.get("v_op", 0.0))
         except (KeyError, TypeError, AttributeError) as error:
             raise MampcError(f"{path}: expected A, B, C, D, dt, u_op, y_op, names; {error!r}") from None
         except MampcError as error:
             raise MampcError(f"{path}: {error}") from None
+        model._require_moderate(path)
+        return model
+
+    def _require_moderate(self, path: str | Path) -> None:
+        largest = max(*self.B.shape, self.n_outputs)
+        if largest > MOST_SIGNALS:
+            raise MampcError(
+                f"{path}: expected a model of at most {MOST_SIGNALS} states, inputs and outputs each, "
+                f"received {self.n_states}, {self.B.shape[1]} and {self.n_outputs}; reduce its order"
+            )
 
 
 class Differentiable(Protocol):

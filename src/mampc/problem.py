@@ -11,6 +11,7 @@ from mampc.arrays import as_limit, as_number, as_weight, as_whole
 from mampc.errors import MampcError
 from mampc.lti import StateSpace
 
+MOST_PREDICTIONS = 5000  # future values of all outputs together; their weights take the square of it
 MOST_MOVES = 1000  # future moves of all inputs together
 LONGEST_HORIZON = 2000  # samples; a condensed problem beyond it is a mistake rather than a wish
 
@@ -110,6 +111,11 @@ class TrackingProblem:
         weight = as_number("output_limit_weight", self.output_limit_weight, 0.0, exclusive=True)
         if weight > 1e8:
             raise MampcError(f"output_limit_weight: expected at most 1e8, received {weight:g}")
+        if n_p * l > MOST_PREDICTIONS:
+            raise MampcError(
+                f"prediction_horizon: expected at most {MOST_PREDICTIONS} predicted outputs, "
+                f"received {n_p} x {l} outputs"
+            )
         if n_c * m > MOST_MOVES:
             raise MampcError(
                 f"control_horizon: expected at most {MOST_MOVES} future moves, received {n_c} x {m} inputs"

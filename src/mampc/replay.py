@@ -17,7 +17,7 @@ from mampc.errors import MampcError
 from mampc.names import Names
 from mampc.regulator import Regulator
 from mampc.regulator_state import RegulatorState
-from mampc.simulation import Run
+from mampc.simulation import Run, told
 
 SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
 
@@ -36,7 +36,7 @@ class Recording:
         v: measured disturbances, shape (T, d).
         u: decided inputs, shape (T, m).
         objective: of each decision, shape (T,), not-a-number where inputs were held.
-        status: of each decision.
+        status, remarks, ignored: of each decision, as text.
         names: of the signals.
     """
 
@@ -47,6 +47,8 @@ class Recording:
     u: Array
     objective: Array
     status: tuple[str, ...]
+    remarks: tuple[str, ...]
+    ignored: tuple[str, ...]
     names: Names
 
     @classmethod
@@ -54,7 +56,9 @@ class Recording:
         """The recording of a simulated run."""
         objective = np.array([decision.objective for decision in run.decisions])
         status = tuple(decision.status.value for decision in run.decisions)
-        return cls(run.t, run.y_measured, run.r, run.v, run.u, objective, status, run.names)
+        said = [told(decision) for decision in run.decisions]
+        remarks, ignored = (tuple(words[kind] for words in said) for kind in ("remarks", "ignored"))
+        return cls(run.t, run.y_measured, run.r, run.v, run.u, objective, status, remarks, ignored, run.names)
 
     @classmethod
     def from_csv(cls, path: str | Path, names: Names) -> Recording:
@@ -73,6 +77,8 @@ class Recording:
             columns(list(names.inputs)),
             table.numbers("objective", finite=False),
             tuple(table.words("status")),
+            tuple(table.words("remarks")),
+            tuple(table.words("ignored")),
             names,
         )
 
@@ -109,7 +115,7 @@ def replay(
         state: from which the recording began.
         recording: what the regulator was told and decided.
         preview: whether it saw the reference over its horizon.
-        tolerance: of inputs and objectives, relative to their size (at least one unit); 0 for the same bits.
+        tolerance: of times, inputs and objectives, relative to their size (at least one unit); 0 for the same bits.
 
     Returns:
         None if every decision came out as recorded.
@@ -132,9 +138,15 @@ def replay(
             measured_disturbance=recording.v[k] if model.n_disturbances else None,
         )
         state = decision.state
-        if decision.status.value != recording.status[k]:
-            return Difference(k, t, "the status", recording.status[k], decision.status.value)
+        for name, said, says in (
+            ("the status", recording.status[k], decision.status.value),
+            ("the remarks", recording.remarks[k], told(decision)["remarks"]),
+            ("the ignored outputs", recording.ignored[k], told(decision)["ignored"]),
+        ):
+            if said != says:
+                return Difference(k, t, name, said or "none", says or "none")
         for name, was, now in (
+            ("the time", t, k * model.dt),
             *zip(recording.names.inputs, recording.u[k].tolist(), decision.u.tolist(), strict=True),
             ("the objective", float(recording.objective[k]), decision.objective),
         ):

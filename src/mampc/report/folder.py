@@ -9,9 +9,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mampc.errors import MampcError
-from mampc.files import PARTIAL, written_whole
+from mampc.files import PARTIAL, read_text, written_whole
 
 MANIFEST = ".mampc-files"  # what a run wrote, so that the next can clear it away
+MANIFEST_LIMIT = 2**24  # bytes
+LONGEST_NAME = 200  # bytes; file systems allow 255, and the name of a file not yet whole is longer
 
 
 class ResultFolder:
@@ -55,6 +57,11 @@ class ResultFolder:
 
     def place(self, name: str) -> Path:
         """Where the file `name` goes; it is listed, so that the next run can clear it away."""
+        if len(os.fsencode(Path(name).name)) > LONGEST_NAME:
+            raise MampcError(
+                f"{name}: expected a file name of at most {LONGEST_NAME} bytes; "
+                "shorten the names of scenarios and signals"
+            )
         if name not in self._names:
             self._names.append(name)
             with written_whole(self.path / MANIFEST) as unfinished:
@@ -75,8 +82,8 @@ class ResultFolder:
     def _of_last_run(self) -> set[str]:
         """The files that the last run put here, as far as its list can be believed."""
         try:
-            names = (self.path / MANIFEST).read_text(encoding="utf-8").splitlines()
-        except OSError:
+            names = read_text(self.path / MANIFEST, MANIFEST_LIMIT, "list of files").splitlines()
+        except MampcError:
             return set()
         root = self.path.resolve()
         return {name for name in names if name and (self.path / name).resolve().is_relative_to(root)}

@@ -24,6 +24,10 @@ def replay_trajectory(
     files = {name: (scenario, controller) for scenario, controller, name in trajectories(study)}
     if path.name not in files:
         raise MampcError(f"replay: expected a file named one of {', '.join(files)}, received {path.name}")
+    if not path.is_file():  # now rather than after a model has been identified
+        raise MampcError(
+            f"replay: expected a file that `mampc run` wrote, received {path}, where there is none"
+        )
     scenario_name, controller_name = files[path.name]
     scenario = next(table for table in study.scenarios if table.name == scenario_name)
     controller = next(table for table in study.controllers if table.name == controller_name)

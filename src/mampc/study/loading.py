@@ -11,10 +11,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from mampc.errors import StudyError
+from mampc.errors import MampcError, StudyError, shown
+from mampc.files import read_text
 from mampc.study.schema import Study, Table
 
-STUDY_FILE_LIMIT = 2**20  # bytes
+STUDY_FILE_LIMIT = 2**18  # bytes
+LONGEST_LINE = 2000  # characters; the time that keys of many parts take grows with the square of their length
+MOST_COMPLAINTS = 20
+LONGEST_COMPLAINT = 300  # characters
 
 
 def builtin_studies() -> list[str]:
@@ -49,58 +53,77 @@ def load_study(source: str | Path, *, trust: bool | None = None) -> Study:
     if not path.is_file():
         raise StudyError(
             f"expected a built-in study ({', '.join(builtin_studies())}) or a TOML file, "
-            f"received {str(source)!r}"
+            f"received {shown(str(source), 200)}"
         )
+    folder = path.resolve().parent
+    if trust is None:
+        trust = folder.is_relative_to(Path.cwd().resolve())
     try:
-        if path.stat().st_size > STUDY_FILE_LIMIT:
-            raise StudyError(
-                f"{path}: expected at most {STUDY_FILE_LIMIT} bytes, received {path.stat().st_size}"
-            )
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path}: expected a readable TOML file, received: {error}") from None
-    study = parse_study(text, str(path))
-    study._folder = path.resolve().parent
-    study._trusted = study._folder.is_relative_to(Path.cwd().resolve()) if trust is None else trust
+        text = read_text(path, STUDY_FILE_LIMIT, "TOML file")
+    except MampcError as error:
+        raise StudyError(str(error)) from None
+    study = parse_study(text, str(path), trust=trust)
+    study._folder = folder
     return study
 
 
-def parse_study(text: str, origin: str = "study") -> Study:
-    """Check the TOML text of a study; `origin` is how messages call it.
+def parse_study(text: str, origin: str = "study", *, trust: bool = False) -> Study:
+    """Check the TOML text of a study.
+
+    Args:
+        text: of the study; a model file that it names is looked for in the current folder.
+        origin: how messages call it.
+        trust: whether a plant named `module:Class` may be imported; text does not tell where it comes from.
 
     Raises:
         StudyError: names each wrong key, its place, and what was expected there.
     """
+    if len(text) > STUDY_FILE_LIMIT:
+        raise StudyError(f"{origin}: expected at most {STUDY_FILE_LIMIT} characters, received {len(text)}")
+    for number, line in enumerate(text.split("\n"), 1):
+        if len(line) > LONGEST_LINE:
+            raise StudyError(
+                f"{origin}: expected lines of at most {LONGEST_LINE} characters, received {len(line)} in line "
+                f"{number}; lists may go on in the next line"
+            )
     try:
         content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise StudyError(f"{origin}: expected TOML, received: {error}") from None
     try:
-        return Study.model_validate(content)
+        study = Study.model_validate(content)
     except ValidationError as error:
         raise StudyError(_complaints(origin, error)) from None
+    study._trusted = trust
+    return study
 
 
 def _complaints(origin: str, error: ValidationError) -> str:
     """One line per wrong key: where it is, what was expected, what came."""
-    lines = []
+    lines: dict[str, None] = {}  # a union reports each of its branches; one line a place is enough
     for problem in error.errors(include_url=False):
-        place = _place(problem["loc"])
-        received = "" if isinstance(problem["input"], dict) else f", received {problem['input']!r}"
-        if problem["type"] == "extra_forbidden":
-            known = _known_keys(problem["loc"][:-1])
-            close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
-            lines.append(f"  {place}: unknown key; {hint}")
-        elif problem["type"] == "missing":
-            lines.append(f"  {place}: expected this key, received none")
-        elif problem["type"] == "value_error":
-            lines.append(f"  {place}: expected {problem['ctx']['error']}{received}")
-        else:
-            message = problem["msg"].removeprefix("Input should be ")
-            lines.append(f"  {place}: expected {message}{received}")
-    # A union reports each of its branches; one line a place is enough.
-    return "\n".join([f"{origin}: {error.title.lower()} not accepted", *dict.fromkeys(lines)])
+        if len(lines) == MOST_COMPLAINTS:
+            lines["  and more like these"] = None
+            break
+        line = _complaint(problem)
+        lines[line if len(line) <= LONGEST_COMPLAINT else f"{line[: LONGEST_COMPLAINT - 3]}..."] = None
+    return "\n".join([f"{origin}: {error.title.lower()} not accepted", *lines])
+
+
+def _complaint(problem: Any) -> str:
+    place = _place(problem["loc"])
+    received = "" if isinstance(problem["input"], dict) else f", received {shown(problem['input'])}"
+    if problem["type"] == "extra_forbidden":
+        known = _known_keys(problem["loc"][:-1])
+        close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
+        return f"  {place}: unknown key; {hint}"
+    if problem["type"] == "missing":
+        return f"  {place}: expected this key, received none"
+    if problem["type"] == "value_error":
+        return f"  {place}: expected {problem['ctx']['error']}{received}"
+    message = problem["msg"].removeprefix("Input should be ")
+    return f"  {place}: expected {message}{received}"
 
 
 def _place(location: tuple[int | str, ...]) -> str:

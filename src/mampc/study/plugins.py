@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import traceback
 from typing import Any
 
 from mampc.errors import MampcError, StudyError
@@ -29,11 +30,13 @@ def make_plant(study: Study) -> Plant:
     maker = PLANTS[kind] if kind in PLANTS else _imported(study)
     try:
         plant: Plant = maker(**study.plant.parameters)
+        missing = [member for member in MEMBERS if not hasattr(plant, member)]
     except TypeError as error:
         raise StudyError(f"plant.parameters: expected parameters of {kind}, received: {error}") from None
     except MampcError as error:
         raise StudyError(f"plant.parameters: {error}") from None
-    missing = [member for member in MEMBERS if not hasattr(plant, member)]
+    except (Exception, SystemExit) as error:
+        raise StudyError(f"plant.kind: expected that {kind} can be made, received {_told(error)}") from None
     if missing or not isinstance(plant.names, Names):
         raise StudyError(
             f"plant.kind: expected a class with members {', '.join(MEMBERS)} (names a mampc.Names), "
@@ -47,16 +50,28 @@ def _imported(study: Study) -> Any:
     module_name, class_name = study.plant.kind.split(":")
     if not study._trusted:
         raise StudyError(
-            f"plant.kind: {study.plant.kind!r} runs code, and this study is not within the current folder; "
-            "look at that code, then allow it with --trust"
+            f"plant.kind: {study.plant.kind!r} runs code, and this study is no file within the current folder; "
+            "look at that code, then allow it with --trust (in Python trust=True)"
         )
     folder = str(study._folder)
     sys.path.insert(0, folder)
     try:
-        return getattr(importlib.import_module(module_name), class_name)
+        module = importlib.import_module(module_name)
     except ImportError as error:
         raise StudyError(f"plant.kind: expected a module that can be imported, received: {error}") from None
-    except AttributeError:
-        raise StudyError(f"plant.kind: expected a class in {module_name}, received {class_name!r}") from None
+    except (Exception, SystemExit) as error:
+        raise StudyError(
+            f"plant.kind: expected a module that can be imported, received {_told(error)}"
+        ) from None
     finally:
         sys.path.remove(folder)
+    if not hasattr(module, class_name):
+        raise StudyError(f"plant.kind: expected a class in {module_name}, received {class_name!r}")
+    return getattr(module, class_name)
+
+
+def _told(error: BaseException) -> str:
+    """What went wrong in code of the user's, and where."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f", in line {frames[-1].lineno} of {frames[-1].filename}"
+    return f"{type(error).__name__}: {error}{'' if isinstance(error, SyntaxError) else place}"

@@ -13,7 +13,7 @@ from mampc.arrays import Array, as_vector
 from mampc.condensing import CondensedQP
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
-from mampc.errors import MampcError, StudyError
+from mampc.errors import MampcError, StudyError, shown
 from mampc.estimation import KalmanFilter
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.lti import StateSpace
@@ -294,7 +294,15 @@ def _inside(folder: Path, name: str) -> Path:
     path = Path(name)
     if path.is_absolute():
         return path
-    resolved = (folder / path).resolve()
-    if not resolved.is_relative_to(folder.resolve()):
-        raise StudyError(f"expected a path within the study's folder (or an absolute one), received {name!r}")
+    try:
+        resolved = (folder / path).resolve()
+        inside = resolved.is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError) as error:  # as for links in circles
+        raise StudyError(
+            f"model.file: expected the path of a file, received {shown(name)}: {error}"
+        ) from None
+    if not inside:
+        raise StudyError(
+            f"model.file: expected a path within the study's folder (or an absolute one), received {shown(name)}"
+        )
     return resolved

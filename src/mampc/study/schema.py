@@ -6,7 +6,15 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    model_validator,
+)
 
 from mampc.arrays import LARGEST
 from mampc.controllers.mampc import METHODS, method_of
@@ -19,6 +27,7 @@ PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank, "sofc": SolidOx
 PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 LONGEST_RUN = 1_000_000  # samples
 LONGEST_EXCITATION = 100_000  # samples
+LONGEST_NAME = 80  # bytes, in file names that hold two of them
 
 _SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -36,12 +45,27 @@ def _time(value: Any) -> Any:
         raise ValueError(f"a time such as 10.0 or '10 s' (units {', '.join(_SECONDS)})") from None
 
 
+def file_word(name: str) -> str:
+    """A name as it stands in file names."""
+    return re.sub(r"[\W_]+", "-", name.lower()).strip("-")
+
+
+def _short_as_file(name: str) -> str:
+    if len(file_word(name).encode()) > LONGEST_NAME:
+        raise ValueError(f"a name of at most {LONGEST_NAME} bytes, since files are named by it")
+    return name
+
+
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Time = Annotated[float, BeforeValidator(_time), Field(gt=0, allow_inf_nan=False)]
 Values = Number | list[Number]
 Weight = Number | list[Number] | list[list[Number]]
 Word = Annotated[str, Field(min_length=1, max_length=80)]
+Name = Annotated[Word, AfterValidator(_short_as_file)]
+Whole = Annotated[int, Field(ge=0, le=LONGEST_RUN)]
+Count = Annotated[int, Field(ge=1, le=LONGEST_RUN)]
+Seed = Annotated[int, Field(ge=0, lt=2**64)]
 
 
 class Table(BaseModel):
@@ -55,7 +79,7 @@ class PlantTable(Table):
 
 
 class ModelTable(Table):
-    file: Word
+    file: Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class IdentificationTable(Table):
@@ -66,7 +90,7 @@ class IdentificationTable(Table):
     amplitude: Values
     hold: Annotated[int, Field(ge=1, le=10_000)] = 1
     noise: Values = 0.0
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: Seed = 1
 
     @model_validator(mode="after")
     def _not_endless(self) -> IdentificationTable:
@@ -98,7 +122,7 @@ class ProblemTable(Table):
 
 
 class ChangeTable(Table):
-    at: Annotated[int, Field(ge=0)]
+    at: Whole
     value: Values
 
 
@@ -110,13 +134,13 @@ class ReferenceTable(Table):
 
 
 class ScenarioTable(Table):
-    name: Word
+    name: Name
     noise: Values = 0.0
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     input_disturbance: Values | None = None
     output_disturbance: Values | None = None
     measured_disturbance: Values | None = None
-    disturbance_at: Annotated[int, Field(ge=0)] = 0
+    disturbance_at: Whole = 0
 
 
 class PublishedTable(Table):
@@ -126,14 +150,14 @@ class PublishedTable(Table):
 
 
 class RulesTable(Table):
-    max_moves: Annotated[int, Field(ge=0)] | None = None
+    max_moves: Whole | None = None
     sparsity_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = 1
     price: Values = 0.0
     counting: Literal["elementwise", "simultaneous"] = "elementwise"
     min_size: Values = 0.0
     dwell: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = 1
-    max_moves_per_step: Annotated[int, Field(ge=1)] | None = None
-    blocks: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] | None = None
+    max_moves_per_step: Count | None = None
+    blocks: Annotated[list[Count], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> RulesTable:
@@ -145,7 +169,7 @@ class RulesTable(Table):
 
 
 class ControllerTable(Table):
-    name: Word
+    name: Name
     method: Word
     rules: RulesTable | None = None
     settings: dict[str, Any] = {}
@@ -181,19 +205,19 @@ class SensorsTable(Table):
     y_low: Values | None = None
     y_high: Values | None = None
     largest_jump: Values | None = None
-    confirm: Annotated[int, Field(ge=1)] = 3
-    stuck_after: Annotated[int, Field(ge=2)] | None = 10
-    max_blind_steps: Annotated[int, Field(ge=0)] = 0
+    confirm: Count = 3
+    stuck_after: Annotated[int, Field(ge=2, le=LONGEST_RUN)] | None = 10
+    max_blind_steps: Whole = 0
 
 
 class Study(Table):
     """A checked study; attributes are the keys of the file."""
 
     name: Word
-    steps: Annotated[int, Field(ge=1, le=LONGEST_RUN)]
+    steps: Count
     dt: Time
     threshold: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
-    skip: Annotated[int, Field(ge=0)] = 0
+    skip: Whole = 0
     plant: PlantTable
     identification: IdentificationTable | None = None
     model: ModelTable | None = None
@@ -205,7 +229,7 @@ class Study(Table):
     controllers: Annotated[list[ControllerTable], Field(min_length=1)]
 
     _folder: Path = PrivateAttr(default=Path())
-    _trusted: bool = PrivateAttr(default=True)
+    _trusted: bool = PrivateAttr(default=False)
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:
@@ -225,8 +249,3 @@ class Study(Table):
             if len(set(names)) != len(names):
                 raise ValueError(f"{kind} with names that differ in letters or digits; received {names}")
         return self
-
-
-def file_word(name: str) -> str:
-    """A name as it stands in file names."""
-    return re.sub(r"[\W_]+", "-", name.lower()).strip("-")
