@@ -56,10 +56,24 @@ def test_a_run_is_written_with_all_its_columns_in_full_precision(tmp_path):
         header, *rows = csv.reader(file)
     assert header == [
         "time", "u1", "u2", "y1", "y2", "y1_measured", "y2_measured", "y1_reference", "y2_reference",
-        "status", "objective", "iterations", "solve_time_us", "remarks", "ignored",
+        "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored",
     ]  # fmt: skip
     numbers = np.array([row[:9] for row in rows], dtype=float)
     np.testing.assert_array_equal(numbers, np.column_stack([run.t, run.u, run.y, run.y_measured, run.r]))
     assert [row[9] for row in rows] == ["optimal"] * 8
     assert [float(row[10]) for row in rows] == [decision.objective for decision in run.decisions]
     assert list(tmp_path.iterdir()) == [tmp_path / "run.csv"]
+
+
+def test_the_gaps_of_a_run_are_shares_of_its_objectives():
+    problem = tank_problem()
+    rules = mampc.MoveRules(max_moves=3)
+    gaps = {}
+    for certify in (False, True):
+        controller = mampc.MAMPC(problem, rules, method="greedy", certify=certify)
+        gaps[certify] = mampc.simulate(
+            problem.model, mampc.Regulator(controller), problem.model.y_op + 1.0, steps=20, progress=False
+        ).gaps
+    assert np.isinf(gaps[False]).all()
+    assert ((gaps[True] >= 0) & (gaps[True] < 1)).all()
+    assert (gaps[True] == 0).any()

@@ -179,6 +179,7 @@ def test_the_summary_holds_what_is_promised(result):
                 assert part["tracking_error"] >= 0
             assert entry["without_transient"]["skipped"] == 15
             assert {"median", "p99", "max"} == set(entry["solve_time_us"])
+            assert {"proven", "bounded", "median", "max"} == set(entry["gap"])
             assert sum(entry["status"].values()) == 20
             assert len(entry["travel_per_input"]) == 2
             assert entry["moves"] == sum(entry["moves_per_input"])

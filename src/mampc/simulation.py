@@ -69,6 +69,17 @@ class Run:
         return np.array([decision.solve_time for decision in self.decisions])
 
     @property
+    def gaps(self) -> Array:
+        """How much each plan may cost more than the best one, as a share of its own cost, shape (T,).
+
+        0 where it is proven best, infinite where nothing is proven, not-a-number where inputs were held.
+        """
+        objective = np.array([decision.objective for decision in self.decisions])
+        gap = np.array([decision.gap for decision in self.decisions])
+        shares: Array = np.where(gap > 0, gap / np.maximum(np.abs(objective), 1e-12), gap)
+        return np.where(np.isnan(objective), np.nan, shares)
+
+    @property
     def statuses(self) -> dict[str, int]:
         """How often each status came."""
         return dict(Counter(decision.status.value for decision in self.decisions))
@@ -87,7 +98,7 @@ class Run:
         header = [
             "time", *inputs, *self.names.disturbances, *outputs,
             *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
-            "status", "objective", "iterations", "solve_time_us", "remarks", "ignored",
+            "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
         with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
@@ -95,8 +106,8 @@ class Run:
             writer.writerow(header)
             for row, d in zip(numbers, self.decisions, strict=True):
                 writer.writerow([
-                    *row, d.status.value, d.objective, d.iterations, round(d.solve_time * 1e6, 2),
-                    *told(d).values(),
+                    *row, d.status.value, d.objective, d.lower_bound, d.iterations,
+                    round(d.solve_time * 1e6, 2), *told(d).values(),
                 ])  # fmt: skip
 
 

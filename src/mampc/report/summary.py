@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mampc.arrays import Array
 from mampc.metrics import Metrics
 from mampc.simulation import Run
 from mampc.study import StudyResult
@@ -56,7 +57,19 @@ def _controller(run: Run, threshold: float, skip: int) -> dict[str, Any]:
             "max": float(microseconds.max()),
         },
         "status": run.statuses,
+        "gap": _gap(run.gaps),
         "plant_faults": dict(Counter(fault for faults in run.faults.values() for fault in faults)),
+    }
+
+
+def _gap(gaps: Array) -> dict[str, float | None]:
+    """How many decisions are proven best, and how far the others may be from that, where a bound is known."""
+    bounded = gaps[np.isfinite(gaps)]
+    return {
+        "proven": float((gaps == 0).mean()),
+        "bounded": len(bounded) / len(gaps),
+        "median": float(np.median(bounded)) if len(bounded) else None,
+        "max": float(bounded.max()) if len(bounded) else None,
     }
 
 
