@@ -204,8 +204,10 @@ class Believed:
             beyond = 100.0 * apart if apart > 0 else np.inf
             low, high = self._limits.u_min[i] - beyond, self._limits.u_max[i] + beyond
             if abs(value) < 1e12 and low < value < high:
-                tolerance = (0.01 * apart if np.isfinite(apart) else 1e-6) * (0.1 if by_hand else 1.0)
+                tolerance = 0.01 * apart if np.isfinite(apart) else 1e-6
                 answer = self._answer(i, value, tolerance)
+                if by_hand:
+                    answer = None if abs(value - self.commands[-1][i]) > 0.1 * tolerance else (0, 0.0)
                 if answer is None:
                     self.applied[-1][i] = value
                 elif answer not in (self._answers[i], (0, 0.0)):

@@ -91,22 +91,23 @@ class Actuators:
         stays = np.abs(told - state.told) <= tolerance
         if by_hand is None and (agrees & stays).all():  # the everyday case, at once
             return inputs, ActuatorState(state.commands, told.copy(), late, offset)
-        if by_hand is not None:
-            tolerance = np.where(by_hand, BY_HAND * tolerance, tolerance)
-            agrees = np.abs(told - expected) <= tolerance
         known = (told > self._low) & (told < self._high)
         inputs, late, offset, commands = inputs.copy(), late.copy(), offset.copy(), np.array(state.commands)
         kept = min(len(inputs), len(commands))
-        for i in np.flatnonzero(known & ~(agrees & (stays | (late != 0) | (offset != 0)))):
+        judged = known & ~(agrees & (stays | (late != 0) | (offset != 0)))
+        if by_hand is not None:  # what is told there is no answer to anything decided, nor is what comes next
+            apart = by_hand & known & (np.abs(told - state.commands[-1]) > BY_HAND * tolerance)
+            inputs[-1, apart] = told[apart]
+            commands[:, by_hand] = inputs[-1, by_hand]
+            late[by_hand] = offset[by_hand] = 0.0
+            judged &= ~by_hand
+        for i in np.flatnonzero(judged):
             answer = _answer(commands[::-1, i], state.told[i], told[i], tolerance[i])
             late[i], offset[i] = (0.0, 0.0) if answer is None else answer
             if answer is None:
                 inputs[-1, i] = told[i]
             elif late[i] or offset[i]:  # so what was believed to be something else was decided, too
                 inputs[-kept:, i] = commands[-kept:, i]
-        if by_hand is not None:  # what is told next is no answer to anything decided before
-            commands[:, by_hand] = inputs[-1, by_hand]
-            late[by_hand] = offset[by_hand] = 0.0
         return inputs, ActuatorState(tuple(commands), np.where(known, told, state.told), late, offset)
 
 
