@@ -178,6 +178,9 @@ def test_a_state_of_something_else_is_refused():
     for state in (None, [1.0, 2.0], mampc.Regulator(mpc).initial_state()):
         refuses(mpc.step, state, x, reference)
         refuses(sparse.step, state, x, reference)
+    loop = mampc.Regulator(mpc)
+    for state in (None, mpc.initial_state()):
+        refuses(loop.step, state, reference, reference)
     refuses(mpc.step, sparse.initial_state(), x, reference)
     refuses(sparse.step, mpc.initial_state(), x, reference)
 

@@ -68,6 +68,8 @@ def test_a_state_kept_as_text_leads_to_the_same_decisions_to_the_bit(method):
         (lambda content: json.dumps(content | {"controller": {"inputs": None}}), "shape"),
         (lambda content: json.dumps(content | {"controller": {"inputs": [[1, 1]], "samples": "5"}}), "whole"),
         (lambda content: "[" * 100_000, "received"),
+        (lambda content: json.dumps(content | {"measured_disturbance": [10**400]}), "received"),
+        (lambda content: None, "received"),
     ],
 )  # fmt: skip
 def test_a_text_that_is_no_state_of_this_regulator_is_refused(spoil, expected):

@@ -147,6 +147,8 @@ class Regulator:
             MampcError: arguments that are no numbers or of the wrong shape.
         """
         start = perf_counter()
+        if not isinstance(state, RegulatorState):
+            raise MampcError(f"state: expected a RegulatorState, received {type(state).__name__}")
         y = as_shaped("y", y, self._y_shape)
         memory, actuators, v_last = state.controller, state.actuators, state.measured_disturbance
         if u_applied is not None:

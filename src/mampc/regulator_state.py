@@ -11,7 +11,7 @@ import numpy as np
 from mampc.actuators import ActuatorState
 from mampc.arrays import Array, as_whole
 from mampc.controllers.decision import ControllerState
-from mampc.errors import MampcError
+from mampc.errors import MampcError, shown
 from mampc.estimation import Estimate
 from mampc.sensors import SensorState
 
@@ -58,10 +58,9 @@ class RegulatorState:
             )
         except MampcError:
             raise
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
-            shown = text if len(text) < 60 else f"{text[:57]}..."
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError):
             raise MampcError(
-                f"state: expected what RegulatorState.to_json writes, received {shown}"
+                f"state: expected what RegulatorState.to_json writes, received {shown(text)}"
             ) from None
 
     def shapes(self) -> dict[str, tuple[int, ...] | None]:
