@@ -17,6 +17,7 @@ from mampc.qp_daqp import DaqpSolver
 
 CACHE_BYTES = 64e6  # for recent patterns and their solvers
 ROUNDING = 1e-8  # input units: a smaller move may be none
+NOTHING = 1e-11  # input units: a smaller move is none, and the others need not make up for it
 SMALLER = 1e-8  # input units: a move that falls short of its least size by no more is rounded up to it
 
 
@@ -223,6 +224,10 @@ class PatternSolver:
 
 def without_rounding(condensed: CondensedQP, instance: Instance, moves: Array) -> Array:
     """The moves with inputs exactly within their limits, and changes too small to count exactly zero."""
+    small = np.abs(moves)
+    nothing = small <= NOTHING
+    if (nothing | (small > ROUNDING)).all():
+        return np.where(nothing, 0.0, moves)
     limits, u = condensed.problem.limits, instance.u_previous
     inputs = u + moves.reshape(-1, len(u)).cumsum(axis=0)
     inputs = np.concatenate((u[None], np.minimum(np.maximum(inputs, limits.u_min), limits.u_max)))
