@@ -70,12 +70,12 @@ def predicted(model, x, plan, samples, input_disturbance=0.0, output_disturbance
 
 
 def violation_scale(problem):
-    """Per output the square root of its weight, or of that of the moves through the largest step response."""
+    """Per output the square root of its weight, or of that of the cheapest move, by its largest step response."""
     model, n_p = problem.model, problem.prediction_horizon
     rest = np.tile(model.u_op, (n_p + 1, 1))
     steps = [model.response(rest + unit) - model.y_op for unit in np.eye(model.n_inputs)]
-    reach = np.abs(steps).max(axis=(0, 1))
-    moving = np.abs(problem.move_weight).max() / np.maximum(reach, 1e-6) ** 2
+    reach = np.abs(steps).max(axis=1)
+    moving = (np.diag(problem.move_weight)[:, None] / np.maximum(reach, 1e-12) ** 2).min(axis=0)
     return np.sqrt(np.maximum(np.abs(np.diag(problem.output_weight)), moving))
 
 

@@ -192,6 +192,7 @@ class Believed:
         self.applied, self._remembered = [row.copy() for row in applied], len(applied)
         self.commands = [applied[0].copy() for _ in range(12)] + [row.copy() for row in applied]
         self._last, self._answers = applied[-1].copy(), [(0, 0.0)] * len(applied[0])
+        self._by_hand = [False] * len(applied[0])
         self._apart, self._limits = limits.u_max - limits.u_min, limits
 
     def decided(self, u):
@@ -201,6 +202,7 @@ class Believed:
     def told(self, told, manual):
         for i, value in enumerate(told):
             by_hand, apart = manual is not None and manual[i], self._apart[i]
+            by_hand, self._by_hand[i] = by_hand or self._by_hand[i], by_hand  # also just after it
             beyond = 100.0 * apart if apart > 0 else np.inf
             low, high = self._limits.u_min[i] - beyond, self._limits.u_max[i] + beyond
             if abs(value) < 1e12 and low < value < high:

@@ -251,3 +251,19 @@ def test_out_of_time_plain_mpc_holds_and_says_so(manual):
 def test_a_time_limit_that_makes_no_sense_is_refused(limit):
     with pytest.raises(mampc.MampcError, match=r"time_limit: expected.*received"):
         mampc.MPC(tank_problem(), time_limit=limit)
+
+
+def test_the_last_move_by_hand_counts_however_small():
+    """It is told of at the first sample in automatic, and the valve is not moved back."""
+    model = mampc.StateSpace([[0.9]], [[0.2]], [[1.0]], None, 1.0)
+    limits = mampc.Limits(u_min=-10.0, u_max=10.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=20, control_horizon=5, limits=limits)
+    rules = mampc.MoveRules(max_moves=2, sparsity_horizon=3, price=100.0)
+    loop = mampc.Regulator(mampc.MAMPC(problem, rules))
+    state = loop.initial_state([0.0], [0.0])
+    for told, manual in ((0.0, True), (0.03, True), (0.07, False), (0.07, False)):
+        decision = loop.step(state, [0.0], [0.0], u_applied=[told], manual=[manual])
+        assert decision.u[0] == told
+        state = decision.state
+    decision = loop.step(state, [0.0], [0.0], u_applied=[0.09])  # a reading, as near as everyday ones are
+    assert decision.u[0] == 0.07

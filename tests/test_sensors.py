@@ -231,7 +231,7 @@ def test_sensor_checks_out_of_range_are_refused(options):
         tank_regulator(max_blind_steps=-1)
 
 
-@pytest.mark.parametrize("step", [0.1, 0.4, 1.0, 2.0])
+@pytest.mark.parametrize("step", [0.02, 0.1, 0.4, 1.0])
 @pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=1.0)])
 def test_a_coarse_sensor_is_not_stuck_while_the_controller_balances_a_load(rules, step):
     """Its number stays the same for many samples although the inputs move: a load moves the other way."""
@@ -240,7 +240,7 @@ def test_a_coarse_sensor_is_not_stuck_while_the_controller_balances_a_load(rules
     problem = mampc.TrackingProblem(model, prediction_horizon=20, control_horizon=5, limits=limits)
     loads = {
         "slow ramp": lambda k: -0.05 * min(max(0, k - 50), 100),
-        "fast ramp": lambda k: -0.3 * min(max(0, k - 50), 100),
+        "fast ramp": lambda k: -0.2 * min(max(0, k - 50), 50),
         "slow wave": lambda k: 8.0 * np.sin(k / 32.0),
     }
     for load in loads.values():
@@ -265,8 +265,8 @@ def test_a_coarse_sensor_that_is_stuck_is_found_in_the_end():
         state = decision.state
         faults.append(decision.ignored_outputs.get("y1"))
         x = 0.9 * x + 0.1 * decision.u[0]
-    assert Fault.STUCK in faults[100:]
-    assert Fault.STUCK not in faults[:100]
+    assert Fault.STUCK in faults[80:120]
+    assert Fault.STUCK not in faults[:80]
 
 
 def test_an_output_that_washes_out_has_a_largest_jump_too():

@@ -118,3 +118,23 @@ def test_inputs_in_units_far_from_one_another_take_no_more_iterations(seed):
             assert decision.iterations < 100
             np.testing.assert_array_equal(again.u, decision.u)
             state = decision.state
+
+
+@pytest.mark.parametrize("u", [[1.0, 1e-2], [1.0, 1e3], [1e-4, 1e2]])
+@pytest.mark.parametrize("y", [[1.0, 1.0], [1.0, 1e7], [1e-5, 1e3]])
+def test_what_a_violated_output_limit_costs_does_not_depend_on_units(u, y):
+    """One input moves the second output much more than the other does, and both limits cannot be kept."""
+    decisions = []
+    for u_unit, y_unit in ((np.ones(2), np.ones(2)), (np.array(u), np.array(y))):
+        B = np.array([[0.3, 0.02], [-0.2, 0.1]]) / u_unit
+        model = mampc.StateSpace(0.9 * np.eye(2), B, np.diag(y_unit), None, 1.0)
+        limits = mampc.Limits(u_min=-3 * u_unit, u_max=3 * u_unit, y_max=2 * y_unit)
+        problem = mampc.TrackingProblem(
+            model, prediction_horizon=10, control_horizon=3, limits=limits,
+            output_weight=1 / y_unit**2, move_weight=0.1 / u_unit**2,
+        )  # fmt: skip
+        mpc = mampc.MPC(problem)
+        decision = mpc.step(mpc.initial_state(), [3.3, 4.9], [0.0, 0.0])
+        decisions.append((decision.u / u_unit, decision.violations / y_unit, decision.objective))
+    for other, usual in zip(decisions[1], decisions[0], strict=True):
+        np.testing.assert_allclose(other, usual, rtol=1e-6, atol=1e-6)

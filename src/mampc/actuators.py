@@ -11,7 +11,7 @@ by hand. Unless told inputs *changed* as decided ones did. Then the actuator obe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,16 +33,18 @@ class ActuatorState:
         told: the last inputs told, shape (m,).
         late: samples that each actuator is late by, shape (m,).
         offset: told less decided input where that is explained by the reading, shape (m,).
+        by_hand: 1 where an input was in manual when it was last told of, else 0, shape (m,).
     """
 
     commands: tuple[Array, ...]
     told: Array
     late: Array
     offset: Array
+    by_hand: Array
 
     def then(self, u: Array) -> ActuatorState:
         """What is remembered after the inputs u (m,) were decided."""
-        return ActuatorState((*self.commands[1:], u), self.told, self.late, self.offset)
+        return replace(self, commands=(*self.commands[1:], u))
 
 
 class Actuators:
@@ -66,7 +68,8 @@ class Actuators:
     def initial(self, inputs: Array) -> ActuatorState:
         """After the inputs (h, m) were applied as decided."""
         none = np.zeros(len(self._each))
-        return ActuatorState((*(inputs[0],) * (LATEST + 1), *inputs)[-LATEST - 2 :], inputs[-1], none, none)
+        commands = (*(inputs[0],) * (LATEST + 1), *inputs)[-LATEST - 2 :]
+        return ActuatorState(commands, inputs[-1], none, none, none)
 
     def applied(
         self, state: ActuatorState, inputs: Array, told: Array, by_hand: BoolArray | None
@@ -89,18 +92,21 @@ class Actuators:
         expected = answered + offset
         agrees = np.abs(told - expected) <= tolerance
         stays = np.abs(told - state.told) <= tolerance
-        if by_hand is None and (agrees & stays).all():  # the everyday case, at once
-            return inputs, ActuatorState(state.commands, told.copy(), late, offset)
+        careful = None if by_hand is None and not state.by_hand.any() else state.by_hand != 0
+        if careful is None and (agrees & stays).all():  # the everyday case, at once
+            return inputs, replace(state, told=told.copy())
         known = (told > self._low) & (told < self._high)
         inputs, late, offset, commands = inputs.copy(), late.copy(), offset.copy(), np.array(state.commands)
         kept = min(len(inputs), len(commands))
         judged = known & ~(agrees & (stays | (late != 0) | (offset != 0)))
-        if by_hand is not None:  # what is told there is no answer to anything decided, nor is what comes next
-            apart = by_hand & known & (np.abs(told - state.commands[-1]) > BY_HAND * tolerance)
+        if careful is not None:  # what is told of manual is no answer to anything decided, also just after it
+            if by_hand is not None:
+                careful = careful | by_hand
+            apart = careful & known & (np.abs(told - state.commands[-1]) > BY_HAND * tolerance)
             inputs[-1, apart] = told[apart]
-            commands[:, by_hand] = inputs[-1, by_hand]
-            late[by_hand] = offset[by_hand] = 0.0
-            judged &= ~by_hand
+            commands[:, careful] = inputs[-1, careful]
+            late[careful] = offset[careful] = 0.0
+            judged &= ~careful
         for i in np.flatnonzero(judged):
             answer = _answer(commands[::-1, i], state.told[i], told[i], tolerance[i])
             late[i], offset[i] = (0.0, 0.0) if answer is None else answer
@@ -108,7 +114,8 @@ class Actuators:
                 inputs[-1, i] = told[i]
             elif late[i] or offset[i]:  # so what was believed to be something else was decided, too
                 inputs[-kept:, i] = commands[-kept:, i]
-        return inputs, ActuatorState(tuple(commands), np.where(known, told, state.told), late, offset)
+        now = np.zeros_like(told) if by_hand is None else by_hand.astype(np.float64)
+        return inputs, ActuatorState(tuple(commands), np.where(known, told, state.told), late, offset, now)
 
 
 def _answer(commands: Array, before: float, told: float, tolerance: float) -> tuple[int, float] | None:

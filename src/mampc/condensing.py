@@ -158,9 +158,8 @@ class CondensedQP:
         self._above_outputs = np.flatnonzero(np.isfinite(limits.y_max))
         self._below_outputs = np.flatnonzero(np.isfinite(limits.y_min))
         tracking = np.abs(np.diag(problem.output_weight))
-        reach = np.abs(self.theta.reshape(-1, l, n)).max(axis=(0, 2))
-        moving = np.abs(problem.move_weight).max() / np.maximum(reach, 1e-6) ** 2
-        self.violation_scale = np.sqrt(np.maximum(np.maximum(tracking, moving), 1e-12))
+        weight = np.maximum(tracking, _least_move_cost(problem))
+        self.violation_scale = np.sqrt(np.where(weight > 0, weight, 1.0))
         # Row 0 is y_0, which nothing can limit.
         fading = fade(problem.prediction_horizon)
         self._fading_above, self._fading_below = fading[self.above // l], fading[self.below // l]
@@ -351,6 +350,21 @@ def _stacked(**maps: Array) -> tuple[Array, Parts]:
         start += len(rows)
     together = np.vstack([rows for name, rows in maps.items() if name != "f_moves"])
     return np.ascontiguousarray(together), Parts(**at)
+
+
+def _least_move_cost(problem: TrackingProblem) -> Array:
+    """Per output the weight of the cheapest move that shifts it by one unit within the horizon, shape (l,)."""
+    model, m = problem.model, problem.model.n_inputs
+    A, B, C, D = model.A, model.B[:, :m], model.C, model.D[:, :m]
+    state, reach, most = np.zeros_like(B), np.abs(D), np.zeros_like(B)
+    for _ in range(problem.prediction_horizon):
+        state = A @ state + B
+        reach, most = np.maximum(reach, np.abs(C @ state + D)), np.maximum(most, np.abs(state))
+    rounding = 1e-12 * (np.abs(C) @ most + np.abs(D))
+    reached = reach > rounding
+    cost = np.abs(np.diag(problem.move_weight)) / np.where(reached, reach, 1.0) ** 2
+    least: Array = np.where(reached, cost, np.inf).min(axis=1)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
 def fade(n_p: int) -> Array:

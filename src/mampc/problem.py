@@ -62,7 +62,7 @@ class TrackingProblem:
 
     with du_j = u_j - u_{j-1} and the input held at its last value beyond the control horizon. The
     violation e >= 0, one value per output for the whole horizon, costs w (a + a^2 / 2) with a = sqrt(q) e, q
-    being the output's own weight (at least that of the moves, seen through the model): an exact penalty,
+    being the output's own weight (at least R of the input that moves it most cheaply): an exact penalty,
     zero whenever the limits can be kept and w is large enough. rho falls evenly from 1 at i = 1 to 1/2 at np, so
     that an output that is outside already is worth bringing back.
 

@@ -7,12 +7,12 @@ Every test is made against what the model predicts, since only that tells a faul
 - jump: further from its prediction than `largest_jump`. Where it stays there (`confirm` samples within
   `largest_jump` of one another), it is the plant that jumped, and it is believed, unless it is a hundred times
   as far from the operating point as the inputs' whole range could move the output;
-- stuck: to the last bit the same for `stuck_after` samples, while the model moved that output by more than a
-  fifth of `largest_jump`. A coarse sensor, whose every change was a multiple of one step and that no small one,
-  may show the same for long while the controller balances a load: it takes ten times as many samples, and
-  movement by all of `largest_jump`. A stuck sensor is believed again once it changes; or, where no other output
-  is believed either, after ten times as long, since a plant at a hard stop (a tank that overflows) looks the
-  same.
+- stuck: to the last bit the same for `stuck_after` samples, and for three times as long as this sensor ever was
+  while healthy, while the model moved that output by more than a fifth of `largest_jump`. A coarse sensor, whose
+  every change was a multiple of one step and that no small one, may show the same for long while the controller
+  balances a load: it takes twice as many samples, and movement by all of `largest_jump`. A stuck sensor is believed
+  again once it changes; or, where no other output is believed either, after ten times `stuck_after` samples, since
+  a plant at a hard stop (a tank that overflows) looks the same.
 """
 
 from __future__ import annotations
@@ -32,8 +32,11 @@ OF_REACH = 0.1  # default jump, as a share of what the inputs' whole range does 
 SOON = 10  # samples
 GIVE_UP = 10  # times `stuck_after` samples blind: then a stuck sensor is believed again
 ABSURD = 100.0  # times that reach from the operating point: no plant gets there, and it is never believed
-COARSE = 5e-3  # times the largest jump: a sensor with larger steps, and that shows nothing between them
-PATIENCE = 10  # times `stuck_after`: how long the number of a coarse sensor may stay the same
+COARSE = 1e-3  # times the largest jump: a sensor with larger steps, and that shows nothing between them
+COARSE_PATIENCE = 2  # times `stuck_after`: how long its number may stay the same
+UNUSUAL = 3  # times as long as it ever did: how long the number of a sensor may stay the same
+PATIENCE = 10  # times `stuck_after`: but no longer
+QUIET = 0.1  # times the movement that a stuck sensor misses: with less of it, equal numbers say nothing
 STUCK = 0.2  # predicted movement, as a share of the largest jump, that a working sensor shows
 
 
@@ -88,6 +91,7 @@ class SensorState:
         moved: how far the model moved the output meanwhile; `LARGEST` once it counts as stuck.
         doubted: how many samples in a row jumped to about the same place.
         disturbance: estimated at the output when its present number first came.
+        longest: run of equal numbers, in samples, that ended with a change although the model moved the output.
         step: that all its changes were multiples of, as long as it is not small; `LARGEST` before the first.
         blind: samples in a row without any output believed.
     """
@@ -97,6 +101,7 @@ class SensorState:
     moved: Array
     doubted: Array
     disturbance: Array
+    longest: Array
     step: Array
     blind: int = 0
 
@@ -131,7 +136,7 @@ class Sensors:
         self._all, self._none = np.ones(l, dtype=bool), np.zeros(l)
         self._fine = COARSE * jump
         self._moving = np.minimum(STUCK * jump, LARGEST / 2)
-        self._start = SensorState(*(self._none,) * 5, np.full(l, LARGEST))
+        self._start = SensorState(*(self._none,) * 6, np.full(l, LARGEST))
 
     def initial(self) -> SensorState:
         """Before the first sample."""
@@ -155,7 +160,8 @@ class Sensors:
         fine = (np.abs(innovation) <= self._jump) & (y != state.y) & (y >= self._low) & (y <= self._high)
         if fine.all():  # the everyday case, at once
             none, step = self._none, self._step(state, y, self._all)
-            return self._all, {}, SensorState(y.copy(), none, none, none, disturbance, step)
+            longest = self._longest(state, self._all)
+            return self._all, {}, SensorState(y.copy(), none, none, none, disturbance, longest, step)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))
         came = ~(missing | out)
@@ -164,7 +170,8 @@ class Sensors:
         repeats = np.where(came, np.where(same, state.repeats + 1, 0), state.repeats)
         moved = np.where(changed, 0.0, state.moved + movement)
         coarse = (state.step > self._fine) & (state.step < LARGEST)
-        long = repeats >= np.where(coarse, PATIENCE * self._stuck_after, self._stuck_after)
+        least = np.where(coarse, COARSE_PATIENCE * self._stuck_after, self._stuck_after)
+        long = repeats >= np.clip(UNUSUAL * state.longest, least, PATIENCE * self._stuck_after)
         stuck = same & long & (np.abs(moved) > np.where(coarse, self._jump, self._moving))
         if state.blind >= GIVE_UP * self._stuck_after:
             repeats[stuck], moved[stuck], stuck = 0.0, 0.0, np.zeros_like(stuck)
@@ -179,7 +186,8 @@ class Sensors:
         believed = came & ~stuck & ~jump
         after = SensorState(
             np.where(came, y, state.y), repeats, moved, doubted,
-            np.where(changed, disturbance, state.disturbance), self._step(state, y, changed),
+            np.where(changed, disturbance, state.disturbance),
+            self._longest(state, changed), self._step(state, y, changed),
             0 if believed.any() else state.blind + 1,
         )  # fmt: skip
         faults = {}
@@ -188,6 +196,14 @@ class Sensors:
         ):  # fmt: skip
             faults.update({self._names[i]: fault for i in np.flatnonzero(affected)})
         return believed, faults, after
+
+    def _longest(self, state: SensorState, changed: BoolArray) -> Array:
+        """The longest run of equal numbers of a sensor that was not stuck, shape (l,)."""
+        if not state.repeats.any():
+            return state.longest
+        healthy = changed & (np.abs(state.moved) > QUIET * self._moving) & (state.moved < LARGEST)
+        longest: Array = np.where(healthy, np.maximum(state.longest, state.repeats), state.longest)
+        return longest
 
     def _step(self, state: SensorState, y: Array, changed: BoolArray) -> Array:
         """The greatest common divisor of all changes so far, shape (l,), found step by step."""
