@@ -205,7 +205,7 @@ class Believed:
             by_hand, self._by_hand[i] = by_hand or self._by_hand[i], by_hand  # also just after it
             beyond = 100.0 * apart if apart > 0 else np.inf
             low, high = self._limits.u_min[i] - beyond, self._limits.u_max[i] + beyond
-            if abs(value) < 1e12 and low < value < high:
+            if abs(value) < 5e11 and low < value < high:
                 tolerance = 0.01 * apart if np.isfinite(apart) else 1e-6
                 answer = self._answer(i, value, tolerance)
                 if by_hand:

@@ -267,3 +267,14 @@ def test_the_last_move_by_hand_counts_however_small():
         state = decision.state
     decision = loop.step(state, [0.0], [0.0], u_applied=[0.09])  # a reading, as near as everyday ones are
     assert decision.u[0] == 0.07
+
+
+def test_an_input_without_limits_is_not_believed_to_be_where_none_is_ever_decided():
+    """It would be brought back at once, du_max or not."""
+    model = mampc.StateSpace([[0.46]], [[0.1]], [[0.4]], None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=3, control_horizon=1, limits=mampc.Limits(du_max=0.1)
+    )
+    loop = mampc.Regulator(mampc.MPC(problem))
+    decision = loop.step(loop.initial_state(), [0.0], [0.0], u_applied=[9.9e11])
+    assert np.abs(decision.u) <= 0.1

@@ -61,8 +61,9 @@ class Actuators:
             tolerance = np.where(np.isfinite(apart), NEAR * apart, 1e-6)
         self._tolerance = tolerance
         beyond = np.where(apart > 0, ABSURD * apart, LARGEST)
-        self._low = np.maximum(limits.u_min - beyond, -LARGEST)
-        self._high = np.minimum(limits.u_max + beyond, LARGEST)
+        # Nor is it beyond what controllers decide where there are no limits: half of what counts as a number.
+        self._low = np.maximum(limits.u_min - beyond, -LARGEST / 2)
+        self._high = np.minimum(limits.u_max + beyond, LARGEST / 2)
         self._each = np.arange(len(apart))
 
     def initial(self, inputs: Array) -> ActuatorState:
