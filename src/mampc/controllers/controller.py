@@ -151,7 +151,7 @@ class Controller(ABC):
         depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
         reference = as_shaped("reference", reference, constant if depth == 1 else previewed)
         present = None if limits is None else PresentLimits(limits, self.condensed)
-        by_hand = None if manual is None else self._by_hand(manual)
+        by_hand = self.by_hand(manual)
         if by_hand is not None:
             present = self._released(state, present, by_hand)
         rest = None if by_hand is None else np.where(by_hand, self.problem.control_horizon, 0)
@@ -207,8 +207,14 @@ class Controller(ABC):
             low, high = present.planned_min[0], present.planned_max[0]
         return bool(((u < low - SAME) | (u > high + SAME)).any())
 
-    def _by_hand(self, manual: Any) -> BoolArray | None:
-        """Which inputs are in manual, None for no input."""
+    def by_hand(self, manual: Any) -> BoolArray | None:
+        """Which inputs are in manual, shape (m,), as `step` is told; None for no input.
+
+        Raises:
+            MampcError: the wrong shape.
+        """
+        if manual is None:
+            return None
         flags = as_shaped("manual", manual, self._shape[1:]) != 0.0
         return flags if flags.any() else None
 
