@@ -81,11 +81,12 @@ class CondensedQP:
         self.n_moves = n_c * m
         self.cumulate = np.kron(np.tri(n_c), np.eye(m))
 
-        powers = [np.eye(model.n_states)]  # A^i
+        power = [np.eye(model.n_states)]
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(n_p):
-                powers.append(powers[-1] @ model.A)
-            observed = model.C @ np.array(powers)  # C A^i
+                power.append(power[-1] @ model.A)
+            powers = np.array(power)  # A^i
+            observed = model.C @ powers  # C A^i
             step = np.cumsum([model.D, *(observed[:-1] @ model.B)], axis=0)  # S_i
         if not (np.abs(observed) < LARGEST_RESPONSE).all() or not (np.abs(step) < LARGEST_RESPONSE).all():
             raise MampcError(
@@ -116,13 +117,13 @@ class CondensedQP:
 
         error = root @ error
         if problem.tail_horizon > 0:
-            tail_error, tail_theta = tail(problem, np.array(powers), free.shape[1])
+            tail_error, tail_theta = tail(problem, powers, free.shape[1])
             error, self.weighted_theta = (
                 np.vstack([error, tail_error]), np.vstack([self.weighted_theta, tail_theta]),
             )  # fmt: skip
         H = 2 * (self.weighted_theta.T @ self.weighted_theta + self.R)
         self.H = (H + H.T) / 2
-        lower, upper = self._build_program(free, u_previous)
+        lower, upper = self._build_program(free, u_previous, _least_move_cost(problem, powers, step))
         f = np.zeros((self.program.n_variables, free.shape[1]))
         f[: self.n_violations, self._one_at] = problem.output_limit_weight
         f[self.n_violations :] = -2 * self.weighted_theta.T @ error
@@ -138,8 +139,8 @@ class CondensedQP:
         parts: tuple[Array, Array, Array, Array] = np.zeros(m), np.zeros(l), model.v_op, np.ones(1)
         self._undisturbed_parts, self._undisturbed = parts, np.concatenate(parts)  # (d_u, d_y, v, 1)
 
-    def _build_program(self, free: Array, u_previous: Array) -> tuple[Array, Array]:
-        """The program, and its bounds as affine maps.
+    def _build_program(self, free: Array, u_previous: Array, move_cost: Array) -> tuple[Array, Array]:
+        """The program, and its bounds as affine maps; `move_cost` (l,) is that of moving an output by one unit.
 
         Rows: violations and moves (simple), then inputs after the first sample, then outputs.
         """
@@ -158,7 +159,7 @@ class CondensedQP:
         self._above_outputs = np.flatnonzero(np.isfinite(limits.y_max))
         self._below_outputs = np.flatnonzero(np.isfinite(limits.y_min))
         tracking = np.abs(np.diag(problem.output_weight))
-        weight = np.maximum(tracking, _least_move_cost(problem))
+        weight = np.maximum(tracking, move_cost)
         self.violation_scale = np.sqrt(np.where(weight > 0, weight, 1.0))
         # Row 0 is y_0, which nothing can limit.
         fading = fade(problem.prediction_horizon)
@@ -352,16 +353,17 @@ def _stacked(**maps: Array) -> tuple[Array, Parts]:
     return np.ascontiguousarray(together), Parts(**at)
 
 
-def _least_move_cost(problem: TrackingProblem) -> Array:
-    """Per output the weight of the cheapest move that shifts it by one unit within the horizon, shape (l,)."""
+def _least_move_cost(problem: TrackingProblem, powers: Array, step: Array) -> Array:
+    """Per output the weight of the cheapest move that shifts it by one unit within the horizon, shape (l,).
+
+    Args:
+        powers: A^0 .. A^np, shape (np + 1, n, n).
+        step: S_0 .. S_np, shape (np + 1, l, m), or more columns after the inputs'.
+    """
     model, m = problem.model, problem.model.n_inputs
-    A, B, C, D = model.A, model.B[:, :m], model.C, model.D[:, :m]
-    state, reach, most = np.zeros_like(B), np.abs(D), np.zeros_like(B)
-    for _ in range(problem.prediction_horizon):
-        state = A @ state + B
-        reach, most = np.maximum(reach, np.abs(C @ state + D)), np.maximum(most, np.abs(state))
-    rounding = 1e-12 * (np.abs(C) @ most + np.abs(D))
-    reached = reach > rounding
+    reach = np.abs(step[:, :, :m]).max(axis=0)
+    states = np.abs(np.cumsum(powers[:-1] @ model.B[:, :m], axis=0)).max(axis=0)
+    reached = reach > 1e-12 * (np.abs(model.C) @ states + np.abs(model.D[:, :m]))  # else it is rounding
     cost = np.abs(np.diag(problem.move_weight)) / np.where(reached, reach, 1.0) ** 2
     least: Array = np.where(reached, cost, np.inf).min(axis=1)
     return np.where(np.isfinite(least), least, 0.0)
