@@ -37,7 +37,7 @@ def mpc_against_bare_daqp(*, bounds: bool) -> Row:
     mpc = mampc.MPC(tank_problem())
     asked, program = closed_loop(mpc), mpc.condensed.program
     instances = [
-        mpc.condensed.instance(
+        mpc.condensed.sample(
             mpc.condensed.parameter(a.x, a.state.inputs[-1], a.reference, a.output_disturbance),
             a.state.inputs[-1],
         )

@@ -2,10 +2,10 @@
 
     OMP_NUM_THREADS=1 python benchmarks/methods.py [--markdown]
 
-Every instance is one sample of a random stable model: random state, reference and past inputs. One group of
+Every sample is one sample of a random stable model: random state, reference and past inputs. One group of
 instances shares model, limits and rules, and so a controller of each method; in every second group the input
 limits are narrow, so that plain MPC runs into them. Rules go round: a budget, a price, both. All methods
-answer one instance after the other, in one thread; the first instance of a group is answered but not counted.
+answer one sample after the other, in one thread; the first sample of a group is answered but not counted.
 With `--markdown` the table replaces the one in docs/methods.md.
 """
 
@@ -55,7 +55,7 @@ class Sample(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """One method's answer to one instance."""
+    """One method's answer to one sample."""
 
     objective: float
     lower_bound: float

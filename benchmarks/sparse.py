@@ -47,7 +47,7 @@ def active_share(problem: mampc.TrackingProblem, asked: Sequence[Asked]) -> floa
     for a in asked:
         u_previous = a.state.inputs[-1]
         parameter = condensed.parameter(a.x, u_previous, a.reference, a.output_disturbance)
-        broken.append(condensed.instance(parameter, u_previous).margins.min() < 0)
+        broken.append(condensed.sample(parameter, u_previous).margins.min() < 0)
     return float(np.mean(broken))
 
 
@@ -68,14 +68,14 @@ class BigM:
     def __init__(self, condensed, asked: Asked, most: int) -> None:
         problem, u_previous = condensed.problem, asked.state.inputs[-1]
         parameter = condensed.parameter(asked.x, u_previous, asked.reference, asked.output_disturbance)
-        instance, n, program = condensed.instance(parameter, u_previous), condensed.n_moves, condensed.program
-        self.constant, self.scip = instance.constant, pyscipopt.Model()
+        sample, n, program = condensed.sample(parameter, u_previous), condensed.n_moves, condensed.program
+        self.constant, self.scip = sample.constant, pyscipopt.Model()
         self.scip.hideOutput()
         total, largest = pyscipopt.quicksum, problem.limits.u_max - problem.limits.u_min
         d = [self.scip.addVar(lb=-size, ub=size) for size in np.tile(largest, problem.control_horizon)]
         on = [self.scip.addVar(vtype="B") for _ in range(n)]
         rows = np.vstack([np.eye(program.n_simple, n), program.A])
-        for row, low, high in zip(rows, instance.lower, instance.upper, strict=True):
+        for row, low, high in zip(rows, sample.lower, sample.upper, strict=True):
             self.scip.addCons(low <= (total(row[i] * d[i] for i in np.flatnonzero(row)) <= high))
         for move, moves in zip(d, on, strict=True):
             self.scip.addCons(move <= move.getUbOriginal() * moves)
@@ -86,7 +86,7 @@ class BigM:
         for column, root in zip(np.linalg.cholesky(condensed.H).T, roots, strict=True):
             self.scip.addCons(total(column[i] * d[i] for i in np.flatnonzero(column)) == root)
         self.scip.addCons(total(0.5 * root * root for root in roots) <= curved)
-        self.scip.setObjective(curved + total(f * move for f, move in zip(instance.f_moves, d, strict=True)))
+        self.scip.setObjective(curved + total(f * move for f, move in zip(sample.f_moves, d, strict=True)))
 
     def solve(self) -> None:
         self.scip.optimize()

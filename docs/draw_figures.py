@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mampc.drawing import styled
+from mampc.loop.drawing import styled
 from mampc.report.figures import study_figures
 from mampc.study import load_study, run_study
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 
-from mampc.qp import UNBOUNDED, QPStatus
-from mampc.qp_daqp import DaqpSolver
+from mampc.program.daqp import DaqpSolver
+from mampc.program.qp import UNBOUNDED, QPStatus
 
 # For tests/test_fuzz.py alone; other tests keep the settings that they state.
 settings.register_profile(

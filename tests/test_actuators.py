@@ -11,7 +11,7 @@ import fuzzing
 import mampc
 from builders import identified_tank, random_model, tank_problem
 from mampc import Remark, Status
-from mampc.actuators import Actuators
+from mampc.loop.actuators import Actuators
 
 # Position feedback
 

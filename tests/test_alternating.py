@@ -12,9 +12,10 @@ import pytest
 import mampc
 from builders import cost_of, random_model, same_decision, sample_data, tank_problem
 from mampc import Status
-from mampc.controllers.alternating import HardThreshold
-from mampc.qp import QuadraticProgram
-from mampc.qp_daqp import DaqpSolver
+from mampc.methods.alternating import HardThreshold
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.program.daqp import DaqpSolver
+from mampc.program.qp import QuadraticProgram
 
 SEEDS = range(20)
 LAMBDA, MU, EPS1 = 0.1, 2.0, 1e-3
@@ -127,10 +128,10 @@ def test_at_a_fixed_point_moves_off_the_pattern_pay_lambda_plus_mu(seed):
     decision = decide(controller, past, x, reference)
     assert decision.status is Status.SETTLED
     condensed, pattern = controller.condensed, largest_of_the_window(rules, past, decision.changes)
-    instance = sample_data(condensed, past[-1], x=x, reference=reference)
+    sample = sample_data(condensed, past[-1], x=x, reference=reference)
     weights = np.diag(np.where(pattern.ravel(), 0.0, 2 * MU))
     program = QuadraticProgram(condensed.H + weights, condensed.program.A, condensed.program.n_simple)
-    expected = DaqpSolver(program).solve(instance.f, instance.lower, instance.upper).z
+    expected = DaqpSolver(program).solve(sample.f, sample.lower, sample.upper).z
     np.testing.assert_allclose(decision.changes.ravel(), expected, atol=1e-6)
 
 
@@ -241,8 +242,8 @@ def test_the_window_holds_one_past_change_less_than_the_sparsity_horizon():
     inputs = np.array([[1.0], [2.0], [4.0], [4.0], [8.0]])
     rules = mampc.MoveRules(max_moves=4, sparsity_horizon=3)
     np.testing.assert_array_equal(rules.past_changes(inputs), [[0.0], [4.0]])
-    assert rules.fitted(n_inputs=1, control_horizon=10).past(inputs).left == 3
-    assert rules.fitted(n_inputs=1, control_horizon=2).past(inputs).left == 2
+    assert AdmissiblePatterns(rules, n_inputs=1, control_horizon=10).past(inputs).left == 3
+    assert AdmissiblePatterns(rules, n_inputs=1, control_horizon=2).past(inputs).left == 2
 
 
 def test_the_next_sample_starts_from_the_shifted_pattern():
@@ -327,7 +328,7 @@ def test_without_any_limit_the_polished_plan_is_the_best_on_its_pattern():
 def test_rounding_of_what_was_applied_is_no_move():
     rules = mampc.MoveRules(max_moves=1, sparsity_horizon=3)
     wobbly = np.array([[50.0, 50.0], [50.0 + 1e-12, 50.0], [50.0, 50.0 - 1e-12]])
-    assert rules.fitted(n_inputs=2, control_horizon=5).past(wobbly).left == 1
+    assert AdmissiblePatterns(rules, n_inputs=2, control_horizon=5).past(wobbly).left == 1
 
 
 def test_output_limits_are_softened_in_every_round():

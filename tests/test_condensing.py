@@ -5,9 +5,9 @@ import pytest
 
 import mampc
 from builders import cost_of, predicted, random_model, random_weight, sample_data, tank_model, tank_problem
-from mampc.condensing import CondensedQP
-from mampc.qp import QPStatus
-from mampc.qp_daqp import DaqpSolver
+from mampc.program.condensing import CondensedQP
+from mampc.program.daqp import DaqpSolver
+from mampc.program.qp import QPStatus
 
 SEEDS = range(12)
 
@@ -67,22 +67,22 @@ def test_the_cost_of_any_moves_equals_the_cost_of_their_plan(seed, limits):
 def test_the_quadratic_form_is_the_cost_less_its_constant_part(seed):
     problem, sample = random_case(seed)
     condensed = CondensedQP(problem)
-    instance = sample_data(condensed, **sample)
+    sample = sample_data(condensed, **sample)
     d = np.random.default_rng(seed).standard_normal(condensed.n_moves)
-    quadratic = d @ condensed.H @ d / 2 + instance.f_moves @ d
-    resting = condensed.cost(instance, np.zeros_like(d))
-    assert condensed.cost(instance, d) == pytest.approx(quadratic + resting, rel=1e-10)
+    quadratic = d @ condensed.H @ d / 2 + sample.f_moves @ d
+    resting = condensed.cost(sample, np.zeros_like(d))
+    assert condensed.cost(sample, d) == pytest.approx(quadratic + resting, rel=1e-10)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_optimum_without_limits_is_at_hand_in_the_instance(seed):
     problem, sample = random_case(seed)
     condensed = CondensedQP(problem)
-    instance = sample_data(condensed, **sample)
-    d = instance.moves
-    np.testing.assert_allclose(condensed.H @ d + instance.f_moves, 0.0, atol=1e-9 * np.abs(condensed.H).max())
-    np.testing.assert_allclose(instance.inputs, planned_inputs(problem, sample, d).ravel())
-    assert instance.cost == pytest.approx(condensed.cost(instance, d), rel=1e-9, abs=1e-9)
+    sample = sample_data(condensed, **sample)
+    d = sample.moves
+    np.testing.assert_allclose(condensed.H @ d + sample.f_moves, 0.0, atol=1e-9 * np.abs(condensed.H).max())
+    np.testing.assert_allclose(sample.inputs, planned_inputs(problem, sample, d).ravel())
+    assert sample.cost == pytest.approx(condensed.cost(sample, d), rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -90,8 +90,8 @@ def test_margins_are_the_distances_of_that_optimum_to_each_bound(seed):
     limits = mampc.Limits(u_min=-1.0, u_max=2.0, du_max=0.5, y_min=-1.0, y_max=1.5)
     problem, sample = random_case(seed, limits=limits)
     condensed = CondensedQP(problem)
-    instance = sample_data(condensed, **sample)
-    d = instance.moves
+    sample = sample_data(condensed, **sample)
+    d = sample.moves
     u = planned_inputs(problem, sample, d)
     y = predicted(
         problem.model, sample["x"], u, problem.prediction_horizon + 1,
@@ -99,7 +99,7 @@ def test_margins_are_the_distances_of_that_optimum_to_each_bound(seed):
     )[1:]  # fmt: skip
     distances = [u + 1, 2 - u, 0.5 - d, d + 0.5, y + 1, 1.5 - y]
     nearest = min(distance.min() for distance in distances)
-    assert instance.margins.min() == pytest.approx(nearest, abs=1e-9)
+    assert sample.margins.min() == pytest.approx(nearest, abs=1e-9)
 
 
 def test_a_constant_reference_equals_its_preview():
@@ -127,14 +127,14 @@ def test_a_restricted_program_equals_the_full_one_with_zeros_forced(seed, limits
     problem, sample = random_case(seed, limits=limits, output_limit_weight=20.0)
     condensed = CondensedQP(problem)
     sample["u_previous"] = np.clip(sample["u_previous"], -1.0, 1.0)
-    instance, v = sample_data(condensed, **sample), condensed.n_violations
+    sample, v = sample_data(condensed, **sample), condensed.n_violations
     pattern = np.random.default_rng(seed).random(condensed.n_moves) < 0.5
     pattern[0] = True
     restriction = condensed.restricted(pattern)
     part = DaqpSolver(restriction.program).solve(
-        instance.f[restriction.columns],
-        instance.lower[restriction.bounds],
-        instance.upper[restriction.bounds],
+        sample.f[restriction.columns],
+        sample.lower[restriction.bounds],
+        sample.upper[restriction.bounds],
     )
     forced = mampc.qp.QuadraticProgram(  # the full program, each idle move fixed by a row of its own
         condensed.program.H,
@@ -142,9 +142,7 @@ def test_a_restricted_program_equals_the_full_one_with_zeros_forced(seed, limits
         condensed.program.n_simple,
     )
     idle = np.zeros((~pattern).sum())
-    full = DaqpSolver(forced).solve(
-        instance.f, np.append(instance.lower, idle), np.append(instance.upper, idle)
-    )
+    full = DaqpSolver(forced).solve(sample.f, np.append(sample.lower, idle), np.append(sample.upper, idle))
     assert part.status is full.status is QPStatus.OPTIMAL
     np.testing.assert_allclose(part.z, full.z[restriction.columns], atol=1e-8)
 

@@ -10,10 +10,11 @@ import pytest
 import mampc
 from builders import cost_of, predicted, random_model, sample_data
 from mampc import Status
-from mampc.condensing import CondensedQP
-from mampc.controllers import ranking
-from mampc.controllers.pattern_solver import PatternSolver
-from mampc.qp import QPStatus
+from mampc.methods.exact import ranking
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.pattern_solver import PatternSolver
+from mampc.program.condensing import CondensedQP
+from mampc.program.qp import QPStatus
 from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
 
 SEEDS = range(300)
@@ -310,7 +311,7 @@ def test_a_search_over_signs_that_is_cut_short_says_so_and_offers_what_it_found(
         limits=mampc.Limits(u_max=model.u_op + 0.5, u_min=model.u_op - 0.5),
     )  # fmt: skip
     condensed = CondensedQP(problem, bound_every_move=True)
-    admissible = mampc.MoveRules(min_size=0.3).fitted(1, 6)
+    admissible = AdmissiblePatterns(mampc.MoveRules(min_size=0.3), 1, 6)
     data = sample_data(condensed, model.u_op, x=np.ones(3), reference=model.y_op + 0.3)
     pattern = np.ones(6, dtype=bool)
     whole = PatternSolver(condensed, admissible).solve(data, pattern)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import mampc
-from mampc.csv_table import CSV_FILE_LIMIT, CSVTable
-from mampc.files import written_whole
-from mampc.lti import MOST_SIGNALS
+from mampc.base.csv_table import CSV_FILE_LIMIT, CSVTable
+from mampc.base.files import written_whole
 from mampc.report.folder import MANIFEST, ResultFolder
+from mampc.systems.state_space import MOST_SIGNALS
 
 READERS = {
     "model": mampc.StateSpace.load,
@@ -57,7 +57,7 @@ def test_a_record_is_bounded_and_takes_little_more_memory_than_its_file(tmp_path
     with pytest.raises(mampc.MampcError, match="at most 64 MiB"):
         CSVTable(path)
     path.write_text("u,y\n" + "1,2\n" * 100_000)
-    monkeypatch.setattr("mampc.csv_table.CSV_FILE_LIMIT", 2**20)  # what is read into is as long at first
+    monkeypatch.setattr("mampc.base.csv_table.CSV_FILE_LIMIT", 2**20)  # what is read into is as long at first
     tracemalloc.start()
     assert len(CSVTable(path).numbers("u")) == 100_000
     assert tracemalloc.get_traced_memory()[1] < 2**20 + 4 * path.stat().st_size

@@ -8,6 +8,7 @@ import pytest
 import mampc
 from builders import cost_of, random_model, same_decision, tank_problem
 from mampc import MampcError, MoveRules, Status
+from mampc.moves.admissible import AdmissiblePatterns
 from referees import charge, keeps_rules
 
 SETTINGS = {"alternating": {"polish": True, "warm_up": 0}}
@@ -35,7 +36,7 @@ def controller_of(problem, rules, name, **settings):
     return mampc.MAMPC(problem, rules, method=name, **(SETTINGS.get(name, {}) | settings))
 
 
-def instance(seed, *, control_horizon=4, narrow=True, **changes):
+def sample(seed, *, control_horizon=4, narrow=True, **changes):
     """A random problem, past inputs (3, m), state and reference; narrow input limits are active."""
     rng = np.random.default_rng(seed)
     model = random_model(seed)
@@ -57,7 +58,7 @@ def decide(controller, past, x, reference):
 @every_method
 def test_plans_keep_limits_and_rules_and_cost_what_they_say(name, rules):
     for seed in range(4):
-        problem, past, x, reference = instance(seed)
+        problem, past, x, reference = sample(seed)
         decision = decide(controller_of(problem, rules, name), past, x, reference)
         changes = np.diff(np.vstack([past[-1:], decision.plan]), axis=0)
         np.testing.assert_allclose(decision.changes, changes, atol=1e-12)
@@ -74,7 +75,7 @@ def test_plans_keep_limits_and_rules_and_cost_what_they_say(name, rules):
 @every_heuristic
 def test_no_plan_is_better_than_the_proven_optimum(name, rules):
     for seed in range(4):
-        asked = instance(seed)
+        asked = sample(seed)
         best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
         found = decide(controller_of(asked[0], rules, name), *asked[1:])
         assert best.status is Status.OPTIMAL
@@ -90,9 +91,9 @@ def test_no_plan_is_better_than_the_proven_optimum(name, rules):
 @every_method
 @pytest.mark.parametrize("narrow", [False, True])
 def test_a_budget_of_all_moves_gives_the_plan_of_plain_mpc(name, narrow):
-    problem, past, x, reference = instance(3, narrow=narrow)
+    problem, past, x, reference = sample(3, narrow=narrow)
     rules = MoveRules(max_moves=3 * 2 + 2)  # all of the 4 x 2 moves
-    assert not rules.fitted(2, 4).unrestricted
+    assert not AdmissiblePatterns(rules, 2, 4).unrestricted
     decision = decide(controller_of(problem, rules, name), past, x, reference)
     plain = decide(mampc.MPC(problem), past[-1:], x, reference)
     np.testing.assert_allclose(decision.plan, plain.plan, atol=1e-7)
@@ -103,7 +104,7 @@ def test_a_budget_of_all_moves_gives_the_plan_of_plain_mpc(name, narrow):
 @pytest.mark.parametrize("rules", [RULES["budget"], RULES["budget and price"]])
 def test_a_certificate_holds_the_proven_optimum(name, rules):
     for seed in range(4):
-        asked = instance(seed)
+        asked = sample(seed)
         best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
         certified = decide(controller_of(asked[0], rules, name, certify=True), *asked[1:])
         plain = decide(controller_of(asked[0], rules, name), *asked[1:])
@@ -152,7 +153,7 @@ def test_a_step_is_pure_and_its_state_can_be_pickled(name):
 
 @every_method
 def test_a_measurement_that_is_no_number_holds_the_inputs_and_spoils_nothing(name):
-    problem, past, x, reference = instance(1)
+    problem, past, x, reference = sample(1)
     controller = controller_of(problem, RULES["budget"], name)
     before = decide(controller, past, x, reference)
     held = decide(controller, past, np.full(3, np.nan), reference)
@@ -194,7 +195,7 @@ def test_settings_out_of_range_are_refused(name, setting, value):
 
 @every_heuristic
 def test_a_name_and_an_object_with_the_same_settings_decide_alike(name):
-    problem, past, x, reference = instance(1)
+    problem, past, x, reference = sample(1)
     named = decide(controller_of(problem, RULES["budget"], name), past, x, reference)
     method = mampc.METHODS[name](**SETTINGS.get(name, {}))
     given = decide(mampc.MAMPC(problem, RULES["budget"], method=method), past, x, reference)

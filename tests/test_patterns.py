@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import mampc
-from mampc.patterns import Exchanges
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.exchanges import PatternNeighbours
 from referees import all_patterns, charge, counted, keeps_rules, moved
 
 SEEDS = range(120)
@@ -49,7 +50,7 @@ def as_set(patterns):
 
 def fitted(seed):
     rules, n_c, m, past = random_rules(seed)
-    admissible = rules.fitted(m, n_c)
+    admissible = AdmissiblePatterns(rules, m, n_c)
     return admissible, admissible.past(past)
 
 
@@ -122,7 +123,7 @@ def test_single_exchanges_lead_to_all_admissible_neighbours_at_their_price(seed)
     def price(pattern):
         return charge(rules, pattern.reshape(n_c, m))
 
-    exchanges = Exchanges(admissible, past)
+    exchanges = PatternNeighbours(admissible, past)
     for pattern in patterns[rng.permutation(len(patterns))[:6]]:
         for i in np.flatnonzero(exchanges.pattern):
             exchanges.change(dropped=int(i))
@@ -156,7 +157,7 @@ def test_single_exchanges_lead_to_all_admissible_neighbours_at_their_price(seed)
 @pytest.mark.parametrize("counting", ["elementwise", "simultaneous"])
 def test_past_moves_beyond_the_budget_leave_no_future_move(counting):
     rules = mampc.MoveRules(max_moves=2, sparsity_horizon=4, counting=counting)
-    admissible = rules.fitted(2, 3)
+    admissible = AdmissiblePatterns(rules, 2, 3)
     past = admissible.past(np.cumsum(np.ones((4, 2)), axis=0))  # three changes of both inputs
     assert past.exceeded
     assert past.left == 0
@@ -166,20 +167,20 @@ def test_past_moves_beyond_the_budget_leave_no_future_move(counting):
 
 
 def test_the_window_looks_back_on_one_change_fewer_than_its_length():
-    admissible = mampc.MoveRules(max_moves=2, sparsity_horizon=3).fitted(1, 3)
+    admissible = AdmissiblePatterns(mampc.MoveRules(max_moves=2, sparsity_horizon=3), 1, 3)
     at = {change: np.where(np.arange(4) >= change, 1.0, 0.0)[:, None] for change in (1, 2, 3)}
     assert [admissible.past(at[change]).left for change in (1, 2, 3)] == [2, 1, 1]
 
 
 def test_a_change_that_is_rounding_is_no_move():
-    admissible = mampc.MoveRules(max_moves=1, sparsity_horizon=3, dwell=3).fitted(1, 2)
+    admissible = AdmissiblePatterns(mampc.MoveRules(max_moves=1, sparsity_horizon=3, dwell=3), 1, 2)
     assert admissible.past(np.array([[1.0], [1.0 + 5e-10], [1.0]])) == (1, (0,), False)
     assert admissible.past(np.array([[1.0], [1.0 + 5e-9], [1.0 + 5e-9]])) == (0, (1,), False)
 
 
 @pytest.mark.parametrize(("age", "rest"), [(1, 3), (2, 2), (3, 1), (4, 0)])
 def test_an_input_rests_for_what_is_left_of_its_dwell_time(age, rest):
-    admissible = mampc.MoveRules(dwell=4).fitted(2, 6)
+    admissible = AdmissiblePatterns(mampc.MoveRules(dwell=4), 2, 6)
     inputs = np.zeros((6, 2))
     inputs[-age:, 0] = 1.0
     past = admissible.past(inputs)
@@ -189,12 +190,12 @@ def test_an_input_rests_for_what_is_left_of_its_dwell_time(age, rest):
 
 
 def test_without_rules_every_pattern_is_admissible_and_any_rule_restricts():
-    assert mampc.MoveRules().fitted(2, 3).unrestricted
+    assert AdmissiblePatterns(mampc.MoveRules(), 2, 3).unrestricted
     for rule in (
         {"max_moves": 1}, {"price": (0.0, 1.0)}, {"min_size": (0.0, 1.0)}, {"dwell": 2},
         {"max_moves_per_step": 1}, {"blocks": (2, 1)},
     ):  # fmt: skip
-        assert not mampc.MoveRules(**rule).fitted(2, 3).unrestricted
+        assert not AdmissiblePatterns(mampc.MoveRules(**rule), 2, 3).unrestricted
 
 
 def test_the_random_rules_bind_often():

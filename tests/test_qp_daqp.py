@@ -13,8 +13,8 @@ import pytest
 from scipy import sparse
 
 from mampc import MampcError
-from mampc.qp import QPStatus, QuadraticProgram
-from mampc.qp_daqp import DaqpSolver
+from mampc.program.daqp import DaqpSolver
+from mampc.program.qp import QPStatus, QuadraticProgram
 
 
 def random_program(seed, n=6, rows=8, n_simple=4):

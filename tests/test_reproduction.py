@@ -4,11 +4,11 @@ import re
 
 import pytest
 
+from mampc.compare.sweep import Point, holding, sensitivity, varied
 from mampc.report import reproduction
 from mampc.report.page import Page
 from mampc.study import load_study, parse_study, template
 from mampc.study.running import prepare, regulator_of, run_controller
-from mampc.sweep import Point, holding, sensitivity, varied
 
 
 @pytest.fixture(scope="module")

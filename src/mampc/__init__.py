@@ -4,38 +4,35 @@ See README.md for ten lines that run, docs/ for the rest.
 """
 
 from mampc import plants
-from mampc.controllers import (
+from mampc.base.errors import MampcError, StudyError
+from mampc.base.names import Names
+from mampc.base.words import Fault, Remark, Status
+from mampc.controllers import MAMPC, MPC, ControllerState, Decision
+from mampc.controllers.offset import largest_offset
+from mampc.identification import Identified, IOData, Validation, excite, n4sid, validate
+from mampc.loop.estimation import KalmanFilter
+from mampc.loop.metrics import Metrics
+from mampc.loop.regulator import Regulator
+from mampc.loop.replay import Difference, Recording, replay
+from mampc.loop.run import Run
+from mampc.loop.sensors import SensorChecks
+from mampc.loop.simulation import simulate
+from mampc.loop.state import RegulatorState
+from mampc.methods import (
     ADMM,
     L1,
-    MAMPC,
     METHODS,
-    MPC,
     Alternating,
-    ControllerState,
-    Decision,
     Exact,
     Greedy,
     HardThresholding,
     PenaltyDecomposition,
-    Remark,
     ReweightedL1,
-    Status,
 )
-from mampc.errors import MampcError, StudyError
-from mampc.estimation import KalmanFilter
-from mampc.identification import Identified, IOData, Validation, excite, n4sid, validate
-from mampc.lti import StateSpace, linearise
-from mampc.metrics import Metrics
-from mampc.names import Names
-from mampc.offset import largest_offset
-from mampc.patterns import MoveRules
-from mampc.problem import Limits, TrackingProblem
-from mampc.regulator import Regulator
-from mampc.regulator_state import RegulatorState
-from mampc.replay import Difference, Recording, replay
-from mampc.sensors import Fault, SensorChecks
-from mampc.signals import prbs, steps
-from mampc.simulation import Run, simulate
+from mampc.moves.rules import MoveRules
+from mampc.program.problem import Limits, TrackingProblem
+from mampc.systems.signals import prbs, steps
+from mampc.systems.state_space import StateSpace, linearise
 
 __version__ = "0.1.0"
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from mampc.errors import MampcError
+from mampc.base.errors import MampcError
 
 app = typer.Typer(
     name="mampc",
@@ -263,7 +263,7 @@ def identify(
 
 
 def _is_model(path: Path) -> bool:
-    from mampc.lti import StateSpace
+    from mampc.systems.state_space import StateSpace
 
     try:
         StateSpace.load(path)

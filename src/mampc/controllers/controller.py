@@ -5,50 +5,24 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from mampc.arrays import LARGEST, Array, BoolArray, as_array, as_number, as_shaped, as_vector, is_usable
-from mampc.condensing import CondensedQP
-from mampc.controllers.decision import ControllerState, Decision, Remark, Status
-from mampc.controllers.pattern_solver import PatternSolver
-from mampc.controllers.present import PresentLimits
-from mampc.errors import MampcError
-from mampc.instance import Indices, Instance
-from mampc.patterns import SAME, MoveRules
-from mampc.problem import Limits, TrackingProblem
-from mampc.qp import QPStatus
-from mampc.qp_daqp import DaqpSolver, active_bounds
-
-HELD_BY = {
-    QPStatus.INFEASIBLE: Status.HELD_INFEASIBLE,
-    QPStatus.BAD_DATA: Status.HELD_INFEASIBLE,  # data are finite here, so bounds crossed
-    QPStatus.ITERATION_LIMIT: Status.HELD_SOLVER_FAILED,
-    QPStatus.TIME_LIMIT: Status.HELD_SOLVER_FAILED,
-    QPStatus.FAILED: Status.HELD_SOLVER_FAILED,
-}
-
-
-INSIDE = 1e-9  # input units; a distance to a limit that no rounding can make up
-
-
-class Plan(NamedTuple):
-    """A method's answer: moves d (n_moves,) or None, how it ended, a proven bound, and its next guess.
-
-    `lower_bound` None means that the plan is proven optimal: its own objective is the bound. Inputs
-    (n_moves,) within their limits and the objective are worked out from the moves where not at hand.
-    """
-
-    moves: Array | None
-    status: Status
-    iterations: int
-    lower_bound: float | None = -np.inf
-    guess: Array | None = None
-    inputs: Array | None = None
-    objective: float | None = None
-    remarks: tuple[Remark, ...] = ()
-    active: Array | None = None
+from mampc.base.checks import LARGEST, Array, BoolArray, as_array, as_number, as_shaped, as_vector, is_usable
+from mampc.base.errors import MampcError
+from mampc.base.tolerances import INSIDE, SAME
+from mampc.base.words import Remark, Status
+from mampc.controllers.decision import ControllerState, Decision
+from mampc.methods.method import HELD_BY, Plan
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.pattern_solver import PatternSolver
+from mampc.moves.rules import MoveRules
+from mampc.program.condensing import CondensedQP
+from mampc.program.daqp import DaqpSolver, active_bounds
+from mampc.program.limits_now import LimitsNow
+from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.sample import Indices, Sample
 
 
 class Controller(ABC):
@@ -150,7 +124,7 @@ class Controller(ABC):
         constant, previewed = self._reference_shapes
         depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
         reference = as_shaped("reference", reference, constant if depth == 1 else previewed)
-        present = None if limits is None else PresentLimits(limits, self.condensed)
+        present = None if limits is None else LimitsNow(limits, self.condensed)
         by_hand = self.by_hand(manual)
         if by_hand is not None:
             present = self._released(state, present, by_hand)
@@ -168,21 +142,21 @@ class Controller(ABC):
                 # The way back inside is all that these inputs may move by at once.
                 back = (u_previous != state.inputs[-1]) & np.isfinite(self._du_max)
                 rest = np.maximum(0 if rest is None else rest, back.astype(np.intp))
-            instance = self.condensed.instance(parameter, u_previous, rest)
+            sample = self.condensed.sample(parameter, u_previous, rest)
             if present is not None:
                 if present.crossed:
                     crossed = Plan(None, Status.HELD_INFEASIBLE, 0)
-                    return self._decide(crossed, instance, state, planned_from, present, start)
-                instance = present.applied_to(instance, self.condensed)
-            plan = self._plan(instance, planned_from)
+                    return self._decide(crossed, sample, state, planned_from, present, start)
+                sample = present.applied_to(sample, self.condensed)
+            plan = self._plan(sample, planned_from)
             if plan.status is Status.HELD_INFEASIBLE and planned_from is state:
                 # Inputs outside their limits may be too far to go back within du_max: the limits come first.
                 planned_from = self._brought_inside(state, present)
                 if planned_from is not state:
                     continue
-                if self._may_rest(instance):  # then nothing is infeasible, and it was the numbers that failed
+                if self._may_rest(sample):  # then nothing is infeasible, and it was the numbers that failed
                     plan = plan._replace(status=Status.HELD_SOLVER_FAILED)
-            return self._decide(plan, instance, state, planned_from, present, start)
+            return self._decide(plan, sample, state, planned_from, present, start)
 
     def _check(self, state: ControllerState) -> None:
         if not isinstance(state, ControllerState) or len(state.inputs) != self._memory:
@@ -191,16 +165,16 @@ class Controller(ABC):
                 f"decision of this controller, received {_described(state)}"
             )
 
-    def _may_rest(self, instance: Instance) -> bool:
+    def _may_rest(self, sample: Sample) -> bool:
         """Whether no move at all keeps the hard limits."""
         condensed = self.condensed
         moves, inputs = slice(condensed.n_violations, condensed.program.n_simple), condensed.input_rows
         return all(
-            bool((instance.lower[rows] <= 0).all() and (instance.upper[rows] >= 0).all())
+            bool((sample.lower[rows] <= 0).all() and (sample.upper[rows] >= 0).all())
             for rows in (moves, inputs)
         )
 
-    def _outside(self, u: Array, present: PresentLimits | None) -> bool:
+    def _outside(self, u: Array, present: LimitsNow | None) -> bool:
         """Whether some input that is not in manual is outside its limits."""
         low, high = self._u_min, self._u_max
         if present is not None and not present.crossed:
@@ -219,28 +193,28 @@ class Controller(ABC):
         return flags if flags.any() else None
 
     def _released(
-        self, state: ControllerState, present: PresentLimits | None, by_hand: BoolArray
-    ) -> PresentLimits | None:
+        self, state: ControllerState, present: LimitsNow | None, by_hand: BoolArray
+    ) -> LimitsNow | None:
         """The limits of this sample, which are none for inputs that are held outside them by hand."""
         u = state.inputs[-1]
         low, high = (np.atleast_2d(limit) for limit in self._range(present))
         if not (by_hand & ((u < low) | (u > high)).any(axis=0)).any():
             return present
-        present = PresentLimits(Limits(), self.condensed) if present is None else present
+        present = LimitsNow(Limits(), self.condensed) if present is None else present
         present.release(by_hand)
         return present
 
-    def _planned_from(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
+    def _planned_from(self, state: ControllerState, present: LimitsNow | None) -> ControllerState:
         """The state that plans start from; the state itself unless a method wants another."""
         return state
 
-    def _range(self, present: PresentLimits | None) -> tuple[Array, Array]:
+    def _range(self, present: LimitsNow | None) -> tuple[Array, Array]:
         """Least and largest inputs, shape (m,), or (nc, m) with limits of this sample."""
         if present is None or present.crossed:
             return self._u_min, self._u_max
         return present.u_min, present.u_max
 
-    def _brought_inside(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
+    def _brought_inside(self, state: ControllerState, present: LimitsNow | None) -> ControllerState:
         """The state to plan from where the applied inputs are outside their limits: they go back at once.
 
         That is a move like any other, so it stands in the window of the rules as the latest one.
@@ -259,25 +233,25 @@ class Controller(ABC):
         return 0.0
 
     @abstractmethod
-    def _plan(self, instance: Instance, state: ControllerState) -> Plan:
+    def _plan(self, sample: Sample, state: ControllerState) -> Plan:
         """Search the moves for one sample's data."""
 
     def _decide(
         self,
         plan: Plan,
-        instance: Instance | None,
+        sample: Sample | None,
         state: ControllerState,
         planned_from: ControllerState,
-        present: PresentLimits | None,
+        present: LimitsNow | None,
         start: float,
     ) -> Decision:
         moves, status, iterations, lower_bound, guess, inputs, objective, remarks, active = plan
-        held = moves is None or instance is None
-        if moves is None or instance is None:
+        held = moves is None or sample is None
+        if moves is None or sample is None:
             moves = np.zeros(self.condensed.n_moves)
             objective, lower_bound = np.nan, -np.inf
         elif objective is None:
-            objective = self.condensed.cost(instance, moves) + self._price(moves)
+            objective = self.condensed.cost(sample, moves) + self._price(moves)
         if lower_bound is None:
             lower_bound = objective
         changes = moves.reshape(self._shape)
@@ -291,10 +265,10 @@ class Controller(ABC):
             inputs = np.minimum(np.maximum(planned, low), high)
             if held and planned_from is state and self._outside(planned[0], present):
                 remarks = (*remarks, Remark.BACK_INSIDE)
-            if instance is None:
+            if sample is None:
                 violations = self._unknown_violations
             elif self.condensed.n_violations:
-                violations = self.condensed.violations(instance, moves)
+                violations = self.condensed.violations(sample, moves)
                 violations.setflags(write=False)
         else:
             inputs = inputs.reshape(self._shape)
@@ -321,15 +295,15 @@ class Controller(ABC):
             perf_counter() - start, ControllerState(history, state.samples + 1, guess, active), remarks, violations,
         )  # fmt: skip
 
-    def _unrestricted(self, instance: Instance, state: ControllerState) -> Plan:
+    def _unrestricted(self, sample: Sample, state: ControllerState) -> Plan:
         """Plain MPC: every move is free. Where no limit is active the optimum is at hand already."""
-        if instance.rest is not None:
-            return self._while_resting(instance, instance.rest)
-        margins = instance.margins
+        if sample.rest is not None:
+            return self._while_resting(sample, sample.rest)
+        margins = sample.margins
         if margins[margins.argmin()] > INSIDE:
-            return Plan(instance.moves, Status.OPTIMAL, 0, None, None, instance.inputs, instance.cost)
+            return Plan(sample.moves, Status.OPTIMAL, 0, None, None, sample.inputs, sample.cost)
         self._solver.start(state.active)
-        solution = self._solver.solve(instance.f, instance.lower, instance.upper)
+        solution = self._solver.solve(sample.f, sample.lower, sample.upper)
         if solution.z is None or solution.multipliers is None:
             return Plan(None, HELD_BY[solution.status], solution.iterations)
         return Plan(
@@ -337,14 +311,14 @@ class Controller(ABC):
             active=active_bounds(solution.multipliers),
         )  # fmt: skip
 
-    def _while_resting(self, instance: Instance, rest: Indices) -> Plan:
+    def _while_resting(self, sample: Sample, rest: Indices) -> Plan:
         """Plain MPC where some inputs may not move for some samples."""
         m, n_c = len(rest), self.problem.control_horizon
         if self._resting is None:
             self._resting = PatternSolver(
-                self.condensed, MoveRules().fitted(m, n_c), time_limit=self._time_limit
+                self.condensed, AdmissiblePatterns(MoveRules(), m, n_c), time_limit=self._time_limit
             )
-        solved = self._resting.solve(instance, (np.arange(n_c)[:, None] >= rest).ravel())
+        solved = self._resting.solve(sample, (np.arange(n_c)[:, None] >= rest).ravel())
         if solved.moves is None:
             return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.iterations)
         return Plan(solved.moves, Status.OPTIMAL, solved.iterations, None, objective=solved.objective)

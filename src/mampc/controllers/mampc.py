@@ -2,59 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array, as_vector
-from mampc.condensing import CondensedQP
-from mampc.controllers.admm import ADMM
-from mampc.controllers.alternating import Alternating
-from mampc.controllers.controller import Controller, Plan
-from mampc.controllers.decision import ControllerState, Remark, Status
-from mampc.controllers.exact import Exact
-from mampc.controllers.greedy import Greedy
-from mampc.controllers.hard_thresholding import HardThresholding
-from mampc.controllers.l1 import L1, ReweightedL1
-from mampc.controllers.pattern_solver import ROUNDING, without_rounding
-from mampc.controllers.penalty_decomposition import PenaltyDecomposition
-from mampc.controllers.present import PresentLimits
-from mampc.errors import MampcError
-from mampc.instance import Instance
-from mampc.patterns import MoveRules
-from mampc.problem import TrackingProblem
-
-
-class Search(Protocol):
-    """A method prepared for one problem: plans each sample after `warm_up` samples of plain MPC."""
-
-    warm_up: int
-
-    def plan(self, instance: Instance, state: ControllerState) -> Plan: ...
-
-
-class Method(Protocol):
-    """A frozen set of settings that prepares a search."""
-
-    def prepare(self, condensed: CondensedQP, rules: MoveRules) -> Search: ...
-
-
-METHODS: dict[str, type] = {
-    "exact": Exact,
-    "alternating": Alternating,
-    "greedy": Greedy,
-    "penalty_decomposition": PenaltyDecomposition,
-    "hard_thresholding": HardThresholding,
-    "admm": ADMM,
-    "l1": L1,
-    "reweighted_l1": ReweightedL1,
-}
-
+from mampc.base.checks import Array, as_vector
+from mampc.base.errors import MampcError
+from mampc.base.tolerances import ROUNDING, URGENT
+from mampc.base.words import Remark, Status
+from mampc.controllers.controller import Controller
+from mampc.controllers.decision import ControllerState
+from mampc.methods.method import Method, Plan
+from mampc.methods.registry import method_of
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.rounding import without_rounding
+from mampc.moves.rules import MoveRules
+from mampc.program.limits_now import LimitsNow
+from mampc.program.problem import TrackingProblem
+from mampc.program.sample import Sample
 
 ON_LIMIT_VIOLATION = ("keep_budget", "ignore_budget")
-URGENT = 1e-6  # output units: what suspending the rules has to gain at least
 
 
 class MAMPC(Controller):
@@ -101,7 +68,7 @@ class MAMPC(Controller):
         self._margin = margin if on_limit_violation == "ignore_budget" else None
         self.rules, self._memory = rules, rules.memory
         self.method = method_of(method, settings)
-        self._admissible = rules.fitted(problem.model.n_inputs, problem.control_horizon)
+        self._admissible = AdmissiblePatterns(rules, problem.model.n_inputs, problem.control_horizon)
         self._check_sizes()
         # Without any rule this is plain MPC.
         self._search = None if self._admissible.unrestricted else self.method.prepare(self.condensed, rules)
@@ -113,7 +80,7 @@ class MAMPC(Controller):
             if (size > most).any():
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
-    def _planned_from(self, state: ControllerState, present: PresentLimits | None) -> ControllerState:
+    def _planned_from(self, state: ControllerState, present: LimitsNow | None) -> ControllerState:
         """A pattern says which inputs move, so none may be outside its limits when it is chosen."""
         if present is not None and not present.crossed:
             u = state.inputs[-1]
@@ -128,40 +95,40 @@ class MAMPC(Controller):
     def _price(self, moves: Array) -> float:
         return self._admissible.charge(moves != 0.0)
 
-    def _plan(self, instance: Instance, state: ControllerState) -> Plan:
+    def _plan(self, sample: Sample, state: ControllerState) -> Plan:
         search = self._search
         if search is None:
-            return self._unrestricted(instance, state)
+            return self._unrestricted(sample, state)
         if state.samples >= search.warm_up:
-            plan = self._without_rounding(search.plan(instance, state), instance)
-            return plan if self._margin is None else self._unless_urgent(plan, instance, state, self._margin)
-        plan = self._unrestricted(instance, state)
+            plan = self._without_rounding(search.plan(sample, state.inputs, state.guess), sample)
+            return plan if self._margin is None else self._unless_urgent(plan, sample, state, self._margin)
+        plan = self._unrestricted(sample, state)
         if plan.moves is None:
             return plan
         return plan._replace(status=Status.WARM_UP, lower_bound=-np.inf, objective=None)
 
-    def _without_rounding(self, plan: Plan, instance: Instance) -> Plan:
+    def _without_rounding(self, plan: Plan, sample: Sample) -> Plan:
         """The plan without moves that are too small to count."""
         if plan.moves is None:
             return plan
         size = np.abs(plan.moves)
         if np.count_nonzero(size > ROUNDING) == np.count_nonzero(size):
             return plan
-        moves = without_rounding(self.condensed, instance, plan.moves)
+        moves = without_rounding(self.condensed, sample, plan.moves)
         return plan._replace(moves=moves, inputs=None, objective=None)
 
-    def _unless_urgent(self, plan: Plan, instance: Instance, state: ControllerState, margin: Array) -> Plan:
+    def _unless_urgent(self, plan: Plan, sample: Sample, state: ControllerState, margin: Array) -> Plan:
         """The plan, or that of plain MPC where the rules would cost a violation beyond the margin."""
         if not self.condensed.n_violations:
             return plan
         moves = np.zeros(self.condensed.n_moves) if plan.moves is None else plan.moves
-        violations = self.condensed.violations(instance, moves)
+        violations = self.condensed.violations(sample, moves)
         if not (violations > margin).any():
             return plan
-        urgent = self._unrestricted(instance, state)
+        urgent = self._unrestricted(sample, state)
         if urgent.moves is None:
             return plan
-        lower = self.condensed.violations(instance, urgent.moves) < violations - URGENT
+        lower = self.condensed.violations(sample, urgent.moves) < violations - URGENT
         if not (lower & (violations > margin)).any():
             return plan
         return urgent._replace(
@@ -171,25 +138,3 @@ class MAMPC(Controller):
             inputs=None,
             remarks=(*plan.remarks, Remark.RULES_SUSPENDED),
         )
-
-
-def method_of(method: str | Method, settings: Mapping[str, Any]) -> Method:
-    """A method object from its name and settings, or the object itself; raises `MampcError`."""
-    if isinstance(method, str):
-        if method not in METHODS:
-            raise MampcError(f"method: expected one of {', '.join(METHODS)}, received {method!r}")
-        known = [field.name for field in fields(METHODS[method])]
-        unknown = sorted(set(settings) - set(known))
-        if unknown:
-            raise MampcError(
-                f"method {method!r}: expected settings among {', '.join(known)}, received {', '.join(unknown)}"
-            )
-        chosen: Method = METHODS[method](**settings)
-        return chosen
-    if not hasattr(method, "prepare") or isinstance(method, type):
-        raise MampcError(f"method: expected a name or a method object, received {method!r}")
-    if settings:
-        raise MampcError(
-            f"method: expected settings inside the method object, received {', '.join(settings)} beside it"
-        )
-    return method

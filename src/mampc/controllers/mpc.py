@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from mampc.controllers.controller import Controller, Plan
+from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
-from mampc.instance import Instance
+from mampc.methods.method import Plan
+from mampc.program.sample import Sample
 
 
 class MPC(Controller):
@@ -20,5 +21,5 @@ class MPC(Controller):
         'optimal'
     """
 
-    def _plan(self, instance: Instance, state: ControllerState) -> Plan:
-        return self._unrestricted(instance, state)
+    def _plan(self, sample: Sample, state: ControllerState) -> Plan:
+        return self._unrestricted(sample, state)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array, as_array, as_matrix, as_number, as_vector, as_whole
-from mampc.csv_table import CSVTable
-from mampc.errors import MampcError
-from mampc.files import written_whole
-from mampc.lti import StateSpace
-from mampc.names import Names, require_count
+from mampc.base.checks import Array, as_array, as_matrix, as_number, as_vector, as_whole
+from mampc.base.csv_table import CSVTable
+from mampc.base.errors import MampcError
+from mampc.base.files import written_whole
+from mampc.base.names import Names, require_count
 from mampc.plants import Plant, advance
+from mampc.systems.state_space import StateSpace
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mampc.arrays import Array, as_whole
-from mampc.errors import MampcError
+from mampc.base.checks import Array, as_whole
+from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
 from mampc.identification.realisation import realise
 from mampc.identification.triangular import fold
 from mampc.identification.validation import Validation, validate
-from mampc.lti import StateSpace
+from mampc.systems.state_space import StateSpace
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
 NEAR_BEST = 1.02  # simulation errors that are as good as equal

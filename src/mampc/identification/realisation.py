@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mampc.arrays import Array
-from mampc.errors import MampcError
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError
 from mampc.identification.triangular import fold, solve
 
 _CHUNK = 4096  # samples taken into the triangular factor at once

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mampc.arrays import Array
+from mampc.base.checks import Array
 
 
 def fold(R: Array, rows: Array) -> Array:

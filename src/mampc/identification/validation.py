@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mampc.arrays import Array
-from mampc.errors import MampcError
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
 from mampc.identification.triangular import fold, solve
-from mampc.lti import StateSpace
+from mampc.systems.state_space import StateSpace
 
 
 @dataclass(frozen=True, eq=False)

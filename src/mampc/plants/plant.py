@@ -7,9 +7,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from mampc.arrays import Array
-from mampc.errors import MampcError
-from mampc.names import Names
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError
+from mampc.base.names import Names
 
 
 @runtime_checkable

@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mampc.arrays import Array, as_array, as_number, as_vector
-from mampc.errors import MampcError
-from mampc.names import Names
+from mampc.base.checks import Array, as_array, as_number, as_vector
+from mampc.base.errors import MampcError
+from mampc.base.names import Names
 from mampc.plants.plant import parameter
 
 _PAPER = "Theertham, Varanasi, Jampana: Minimum Attention Control, table of physical constants"

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mampc.arrays import Array
-from mampc.drawing import COLOURS, WIDE, label, new_figure, styled, time_scale
+from mampc.base.checks import Array
+from mampc.compare.sweep import Point
 from mampc.identification import IOData, Validation
-from mampc.simulation import Run
+from mampc.loop.drawing import COLOURS, WIDE, label, new_figure, styled, time_scale
+from mampc.loop.run import Run
 from mampc.study import StudyResult
 from mampc.study.schema import file_word
-from mampc.sweep import Point
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from mampc.errors import MampcError
-from mampc.files import PARTIAL, read_text, written_whole
+from mampc.base.errors import MampcError
+from mampc.base.files import PARTIAL, read_text, written_whole
 
 MANIFEST = ".mampc-files"  # what a run wrote, so that the next can clear it away
 MANIFEST_LIMIT = 2**24  # bytes

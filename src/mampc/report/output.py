@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from mampc.drawing import styled
-from mampc.errors import MampcError
-from mampc.files import written_whole
+from mampc.base.errors import MampcError
+from mampc.base.files import written_whole
+from mampc.loop.drawing import styled
+from mampc.loop.run import Run
 from mampc.report.figures import study_figures
 from mampc.report.folder import ResultFolder
 from mampc.report.summary import summarise
-from mampc.simulation import Run
 from mampc.study import Study, StudyResult, run_study
 from mampc.study.running import Prepared
 from mampc.study.schema import file_word

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from mampc.errors import MampcError
-from mampc.lti import StateSpace
-from mampc.replay import Difference, Recording, replay
+from mampc.base.errors import MampcError
+from mampc.loop.replay import Difference, Recording, replay
 from mampc.report.output import trajectories
 from mampc.study import Study
 from mampc.study.running import initial_state, prepare, regulator_of
+from mampc.systems.state_space import StateSpace
 
 
 def replay_trajectory(

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mampc.compare.sweep import SETTINGS, Point, holding, sensitivity
 from mampc.report.figures import sensitivity_figure, study_figures
 from mampc.report.folder import ResultFolder
 from mampc.report.output import StudyFiles
@@ -22,7 +23,6 @@ from mampc.report.summary import summarise
 from mampc.report.tables import baseline
 from mampc.study import Study, StudyResult, load_study, run_study
 from mampc.study.schema import ControllerTable
-from mampc.sweep import SETTINGS, Point, holding, sensitivity
 
 SIGNIFICANT = 1.25  # an error above this multiple of plain MPC's is a significant loss; the paper names none
 FIGURES = ("changes", "error")

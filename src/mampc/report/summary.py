@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array
-from mampc.metrics import Metrics
-from mampc.simulation import Run
+from mampc.base.checks import Array
+from mampc.loop.metrics import Metrics
+from mampc.loop.run import Run
 from mampc.study import StudyResult
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from mampc.errors import MampcError, StudyError, shown
-from mampc.files import read_text
+from mampc.base.errors import MampcError, StudyError, shown
+from mampc.base.files import read_text
 from mampc.study.schema import Study, Table
 
 STUDY_FILE_LIMIT = 2**18  # bytes

@@ -11,8 +11,8 @@ import sys
 import traceback
 from typing import Any
 
-from mampc.errors import MampcError, StudyError
-from mampc.names import Names
+from mampc.base.errors import MampcError, StudyError
+from mampc.base.names import Names
 from mampc.plants import Plant
 from mampc.study.schema import PLANTS, Study
 

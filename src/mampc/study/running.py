@@ -9,22 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from mampc.arrays import Array, as_vector
-from mampc.condensing import CondensedQP
+from mampc.base.checks import Array, as_vector
+from mampc.base.errors import MampcError, StudyError, shown
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
-from mampc.errors import MampcError, StudyError, shown
-from mampc.estimation import KalmanFilter
 from mampc.identification import Identified, IOData, excite, n4sid
-from mampc.lti import StateSpace
-from mampc.patterns import MoveRules
+from mampc.loop.estimation import KalmanFilter
+from mampc.loop.regulator import Regulator
+from mampc.loop.run import Run
+from mampc.loop.sensors import SensorChecks
+from mampc.loop.simulation import at_rest, simulate
+from mampc.loop.state import RegulatorState
+from mampc.moves.rules import MoveRules
 from mampc.plants import Plant
-from mampc.problem import Limits, TrackingProblem
-from mampc.regulator import Regulator
-from mampc.regulator_state import RegulatorState
-from mampc.sensors import SensorChecks
-from mampc.signals import prbs, steps
-from mampc.simulation import Run, at_rest, simulate
+from mampc.program.condensing import CondensedQP
+from mampc.program.problem import Limits, TrackingProblem
 from mampc.study.plugins import make_plant
 from mampc.study.schema import (
     ControllerTable,
@@ -33,6 +32,8 @@ from mampc.study.schema import (
     Study,
     Values,
 )
+from mampc.systems.signals import prbs, steps
+from mampc.systems.state_space import StateSpace
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,12 @@ from pydantic import (
     model_validator,
 )
 
-from mampc.arrays import LARGEST
-from mampc.controllers.mampc import METHODS, method_of
-from mampc.errors import MampcError
-from mampc.patterns import MoveRules
+from mampc.base.checks import LARGEST
+from mampc.base.errors import MampcError
+from mampc.methods.registry import METHODS, method_of
+from mampc.moves.rules import MoveRules
 from mampc.plants import QuadrupleTank, SolidOxideFuelCell
-from mampc.problem import LONGEST_HORIZON
+from mampc.program.problem import LONGEST_HORIZON
 
 PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank, "sofc": SolidOxideFuelCell}
 PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class

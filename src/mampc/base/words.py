@@ -1,0 +1,64 @@
+"""Every word that a decision may say, with the sentence that explains it: statuses, remarks, faults of sensors."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Self
+
+
+class Sentence(StrEnum):
+    """A word with a `sentence` that says it at length; members are written as `NAME = word, sentence`."""
+
+    sentence: str
+
+    def __new__(cls, value: str, sentence: str) -> Self:
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.sentence = sentence
+        return member
+
+
+class Status(Sentence):
+    """How a decision came about; `status.sentence` says it in words."""
+
+    OPTIMAL = "optimal", "The plan is proven to be the best one."
+    FEASIBLE = (
+        "feasible",
+        "The plan keeps every limit and rule as far as the past allows; a better one may exist.",
+    )
+    SETTLED = "settled", "The method settled; moves off its pattern are small, not zero (see polish)."
+    WARM_UP = "warm_up", "Plain MPC, while the sparse method waits for its first past inputs."
+    ITERATION_LIMIT = "iteration_limit", "The method stopped at its iteration cap before it settled."
+    TIME_LIMIT = "time_limit", "The method stopped at its time limit with the best plan so far."
+    HELD_INFEASIBLE = "held_infeasible", "No plan keeps the limits: the previous inputs are held."
+    HELD_BAD_MEASUREMENT = (
+        "held_bad_measurement",
+        "A state, measurement or reference was not a usable number: the previous inputs are held.",
+    )
+    HELD_SOLVER_FAILED = (
+        "held_solver_failed",
+        "The solver failed or ran out of time: the previous inputs are held.",
+    )
+
+
+class Remark(Sentence):
+    """What else there is to say about a decision; `remark.sentence` says it in words."""
+
+    BUDGET_EXCEEDED = (
+        "budget_exceeded",
+        "The moves already made exceed the budget of their window: no further move is planned.",
+    )
+    BACK_INSIDE = "back_inside", "The applied inputs were outside their limits and go back inside."
+    RULES_SUSPENDED = (
+        "rules_suspended",
+        "The move rules were suspended: under them an output would leave its limits by more than the margin.",
+    )
+
+
+class Fault(Sentence):
+    """Why a measurement was ignored; `fault.sentence` says it in words."""
+
+    MISSING = "missing", "No usable number came."
+    OUT_OF_RANGE = "out_of_range", "The value is outside what the sensor can show."
+    JUMP = "jump", "The value is too far from its prediction to be believed at once."
+    STUCK = "stuck", "The value stays the same to the last bit although the output must have moved."

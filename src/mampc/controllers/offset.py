@@ -1,0 +1,53 @@
+"""How large an offset a price can leave for good.
+
+At rest with an offset e = r - y, an exact controller that does not move now costs at least (L + 1) |e|^2_Q, L being
+the `tail_horizon`: it holds, which costs (np + 1 + L) |e|^2_Q, or it plans to move later; and then the same
+plan one sample earlier would cost no less only if the offset at its end were no smaller than e, so that its
+tail alone costs L |e|^2_Q. Moving every input to its target at once costs the prices of all inputs and e' M e, M being
+the transient. What the optimum does not remove therefore satisfies
+
+    e' ((L + 1) Q - M) e <= sum of prices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.rules import MoveRules
+from mampc.program.condensing import CondensedQP
+from mampc.program.problem import TrackingProblem
+
+
+def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
+    """The largest offset of each output, shape (l,), that the price can leave for good, in output units.
+
+    It holds for `method="exact"` at rest, model and disturbances constant, wherever limits leave room to
+    remove the offset. It is infinite where nothing is promised: the tail horizon is short against the transient,
+    the model has fewer inputs than outputs (or poles at one), or the rules may forbid to move all inputs
+    at once (`max_moves`, `max_moves_per_step`), by less than `min_size`, or at any sample (`blocks`).
+    """
+    model, L = problem.model, problem.tail_horizon
+    m, l = model.n_inputs, model.n_outputs
+    admissible = AdmissiblePatterns(rules, m, problem.control_horizon)
+    nothing = np.full(l, np.inf)
+    all_at_once = np.zeros(admissible.n_moves, dtype=bool)
+    all_at_once[:m] = True
+    rested = admissible.past(np.zeros((rules.memory, m)))
+    promised = admissible.allows(all_at_once, rested) and not admissible.sized and rules.blocks is None
+    stable = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0) < 1 - 1e-9
+    if not promised or not stable or m < l:
+        return nothing
+    gain = model.dc_gain()[:, :m]
+    if np.linalg.matrix_rank(gain) < l:
+        return nothing
+    to_target = np.linalg.pinv(gain)  # moves per unit of offset
+    condensed = CondensedQP(problem)
+    residual = condensed.error_of_reference - condensed.weighted_theta[:, :m] @ to_target
+    M = residual.T @ residual + to_target.T @ condensed.R[:m, :m] @ to_target
+    kept = (L + 1) * problem.output_weight - M
+    if not np.linalg.eigvalsh(kept)[0] > 0:
+        return nothing
+    offset: Array = np.sqrt(admissible.charge(all_at_once) * np.diag(np.linalg.inv(kept)))
+    return offset

@@ -1,0 +1,1 @@
+"""The closed loop: estimator, sensor and actuator checks, regulator, simulation, replay."""

@@ -1,0 +1,213 @@
+"""The regulator: sensor checks, estimator and controller behind one pure step from measurements to inputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import LARGEST, Array, as_shaped, as_vector, as_whole, is_usable
+from mampc.base.errors import MampcError
+from mampc.controllers.controller import Controller
+from mampc.controllers.decision import Decision
+from mampc.loop.actuators import LATEST, Actuators
+from mampc.loop.estimation import KalmanFilter
+from mampc.loop.sensors import SensorChecks, newly_stuck
+from mampc.loop.state import RegulatorState
+from mampc.program.daqp import active_flags
+from mampc.program.problem import Limits
+from mampc.systems.state_space import StateSpace
+
+
+class Regulator:
+    """Output feedback: a controller fed by an estimator, which believes what passes the sensor checks.
+
+    Args:
+        controller: `MPC` or `MAMPC`.
+        estimator: default `KalmanFilter.offset_free` of the controller's model.
+        sensors: when a measurement is believed; default `SensorChecks()`.
+        max_blind_steps: samples in a row that inputs are still planned, on predictions, though no output at
+            all is believed; from then on they are held until one is. 0 holds at once.
+        applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
+            position feedback are never exact. In input units, a scalar or (m,); default a hundredth of the
+            input's range, or 1e-6 where that is not finite.
+
+    Raises:
+        MampcError: arguments of other types, or an estimator of a model of other dimensions.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        estimator: KalmanFilter | None = None,
+        *,
+        sensors: SensorChecks | None = None,
+        max_blind_steps: int = 0,
+        applied_tolerance: Any = None,
+    ) -> None:
+        if not isinstance(controller, Controller):
+            raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
+        if not isinstance(estimator, KalmanFilter | None):
+            raise MampcError(f"estimator: expected a KalmanFilter, received {type(estimator).__name__}")
+        if not isinstance(sensors, SensorChecks | None):
+            raise MampcError(f"sensors: expected SensorChecks, received {type(sensors).__name__}")
+        model = controller.problem.model
+        self.controller = controller
+        self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
+        self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
+        self.estimator = KalmanFilter.offset_free(model) if estimator is None else estimator
+        self._sensors = (SensorChecks() if sensors is None else sensors).fitted(controller.problem)
+        self._v_shape = (model.n_disturbances,)
+        tolerance = None
+        if applied_tolerance is not None:
+            tolerance = as_vector("applied_tolerance", applied_tolerance, model.n_inputs)
+            if (tolerance < 0).any():
+                raise MampcError(f"applied_tolerance: expected at least 0, received {applied_tolerance!r}")
+        self._actuators = Actuators(controller.problem.limits, tolerance)
+        expected, received = _sizes(model), _sizes(self.estimator.model)
+        if received != expected:
+            raise MampcError(f"estimator: expected a model with {expected}, received {received}")
+
+    def initial_state(
+        self, u_previous: Any = None, y: Any = None, measured_disturbance: Any = None
+    ) -> RegulatorState:
+        """At rest under the inputs applied so far.
+
+        Args:
+            u_previous: shape (m,) or (h, m), latest last; default the operating point.
+            y: measurements at that rest, shape (l,); the estimator takes what the model does not
+                explain for a constant disturbance, so that the first step has no jump.
+            measured_disturbance: at that rest, shape (d,); default the operating point.
+
+        Raises:
+            MampcError: arrays of the wrong shape, or numbers that are not finite.
+        """
+        controller = self.controller.initial_state(u_previous)
+        v = self.controller.problem.model.v_op
+        if measured_disturbance is not None:
+            v = as_vector("measured_disturbance", measured_disturbance, len(v))
+        estimate = self.estimator.initial(controller.inputs[-1], y, v)
+        actuators = self._actuators.initial(controller.inputs)
+        return RegulatorState(controller, estimate, v, self._sensors.initial(), actuators)
+
+    def state_from_json(self, text: str) -> RegulatorState:
+        """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
+        state, problem = RegulatorState.from_json(text), self.controller.problem
+        expected = self.initial_state().shapes() | {
+            "controller.guess": (problem.control_horizon, problem.model.n_inputs),
+            "controller.active": (self.controller.condensed.program.n_bounds,),
+        }
+        for place, shape in state.shapes().items():
+            may_be_none = place in ("controller.guess", "controller.active")
+            if shape != expected[place] and not (may_be_none and shape is None):
+                raise MampcError(f"state: expected {place} of shape {expected[place]}, received {shape}")
+        if not active_flags(state.controller.active):
+            raise MampcError(
+                f"state: expected flags at controller.active, received {state.controller.active}"
+            )
+        late = state.actuators.late
+        if not np.isin(late, np.arange(LATEST + 1)).all():
+            raise MampcError(
+                f"state: expected whole numbers up to {LATEST} at actuators.late, received {late}"
+            )
+        return state
+
+    def step(
+        self,
+        state: RegulatorState,
+        y: Any,
+        reference: Any,
+        *,
+        u_applied: Any = None,
+        measured_disturbance: Any = None,
+        limits: Limits | None = None,
+        manual: Any = None,
+    ) -> Decision:
+        """Decide the inputs of this sample from its measurements.
+
+        Args:
+            state: from `initial_state` or the previous decision.
+            y: measured outputs, shape (l,). Those not believed (not-a-number, masked, or refused by the sensor
+                checks) do not correct the estimate; `decision.ignored_outputs` names them. With none left the
+                inputs are held (see `max_blind_steps`).
+            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
+            u_applied: what the plant really got since the last step, shape (m,), if not what was decided:
+                a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided, and so do
+                a value within `applied_tolerance` and one a hundred times further outside its limits than these
+                are apart. What an actuator does later than decided, by up to 10 samples, counts as decided as
+                soon as it shows (see docs/safety.md); so does what is read with a constant offset.
+            measured_disturbance: now, shape (d,), in engineering units; predicted to stay as it is.
+                Left out or not usable, the last one holds on.
+            limits, manual: see `Controller.step`. Tell `u_applied` while an input is in manual; when it is
+                back in automatic, the first plan starts from there.
+
+        Raises:
+            MampcError: arguments that are no numbers or of the wrong shape.
+        """
+        start = perf_counter()
+        if not isinstance(state, RegulatorState):
+            raise MampcError(f"state: expected a RegulatorState, received {type(state).__name__}")
+        y = as_shaped("y", y, self._y_shape)
+        memory, actuators, v_last = state.controller, state.actuators, state.measured_disturbance
+        if u_applied is not None:
+            told = as_shaped("u_applied", u_applied, self._u_shape)
+            by_hand = self.controller.by_hand(manual)
+            inputs, actuators = self._actuators.applied(actuators, memory.inputs, told, by_hand)
+            if inputs is not memory.inputs:
+                memory = replace(memory, inputs=inputs)
+        u_previous = memory.inputs[-1]
+        v = v_last
+        if measured_disturbance is not None:
+            v = _where_usable(as_shaped("measured_disturbance", measured_disturbance, self._v_shape), v_last)
+        estimator, last = self.estimator, state.estimate
+        estimate = estimator.predict(last, u_previous, v_last)
+        estimated = (estimate.x, estimate.output_disturbance, estimate.input_disturbance)
+        if not all(is_usable(part) for part in estimated):
+            # It ran away without measurements: start again.
+            last = estimate = estimator.initial(u_previous, None, v_last)
+        # Measurements show v at once and u later.
+        innovation = estimator.innovation(estimate, u_previous, y, v)
+        movement = estimator.model.C @ (estimate.x - last.x)
+        believed, ignored, sensors = self._sensors.check(
+            state.sensors, y, innovation, movement, last.output_disturbance
+        )
+        if not ignored:
+            estimate = estimator.corrected(estimate, innovation)
+        else:
+            stuck = newly_stuck(state.sensors, sensors)
+            if stuck.any():
+                disturbance = np.where(stuck, sensors.disturbance, estimate.output_disturbance)
+                estimate = replace(estimate, output_disturbance=disturbance)
+            if believed.any():
+                estimate = estimator.corrected(estimate, innovation, believed)
+        blind = sensors.blind > self.max_blind_steps
+        decision = self.controller.step(
+            memory,
+            np.full_like(estimate.x, np.nan) if blind else estimate.x,  # not-a-number: hold
+            reference,
+            output_disturbance=estimate.output_disturbance,
+            input_disturbance=estimate.input_disturbance,
+            measured_disturbance=v,
+            limits=limits,
+            manual=manual,
+        )
+        return replace(
+            decision,
+            state=RegulatorState(decision.state, estimate, v, sensors, actuators.then(decision.u)),
+            ignored_outputs=ignored,
+            solve_time=perf_counter() - start,
+        )
+
+
+def _where_usable(told: Array, otherwise: Array) -> Array:
+    """The numbers told, and the others where they are not usable."""
+    return np.where((told > -LARGEST) & (told < LARGEST), told, otherwise)
+
+
+def _sizes(model: StateSpace) -> str:
+    return (
+        f"{model.n_states} states, {model.n_inputs} inputs, {model.n_outputs} outputs, "
+        f"{model.n_disturbances} measured disturbances"
+    )

@@ -1,0 +1,156 @@
+"""Replaying a recorded run: the same measurements must lead to the same decisions.
+
+What a regulator decides depends on its state and on what it is told, and on nothing else. So a recording of
+what it was told accounts for why it decided as it did, and shows whether anything has changed since.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mampc.base.checks import Array, as_number
+from mampc.base.csv_table import CSVTable
+from mampc.base.errors import MampcError
+from mampc.base.names import Names
+from mampc.loop.regulator import Regulator
+from mampc.loop.run import Run, told
+from mampc.loop.state import RegulatorState
+
+SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a regulator was told in T samples of a simulated run, and what it decided, in engineering units.
+
+    (Neither applied inputs that differ from the decided ones, nor limits of single samples, nor inputs in
+    manual; nor, with preview, a reference that goes on beyond the run.)
+
+    Attributes:
+        t: seconds, shape (T,).
+        y: measurements, shape (T, l), not-a-number where none came.
+        r: references, shape (T, l).
+        v: measured disturbances, shape (T, d).
+        u: decided inputs, shape (T, m).
+        objective: of each decision, shape (T,), not-a-number where inputs were held.
+        status, remarks, ignored: of each decision, as text.
+        names: of the signals.
+    """
+
+    t: Array
+    y: Array
+    r: Array
+    v: Array
+    u: Array
+    objective: Array
+    status: tuple[str, ...]
+    remarks: tuple[str, ...]
+    ignored: tuple[str, ...]
+    names: Names
+
+    @classmethod
+    def of(cls, run: Run) -> Recording:
+        """The recording of a simulated run."""
+        objective = np.array([decision.objective for decision in run.decisions])
+        status = tuple(decision.status.value for decision in run.decisions)
+        said = [told(decision) for decision in run.decisions]
+        remarks, ignored = (tuple(words[kind] for words in said) for kind in ("remarks", "ignored"))
+        return cls(run.t, run.y_measured, run.r, run.v, run.u, objective, status, remarks, ignored, run.names)
+
+    @classmethod
+    def from_csv(cls, path: str | Path, names: Names) -> Recording:
+        """Read what `Run.to_csv` wrote of a plant with these names; raises `MampcError` for anything else."""
+        table = CSVTable(path)
+
+        def columns(words: list[str], *, finite: bool = True) -> Array:
+            read = [table.numbers(word, finite=finite) for word in words]
+            return np.array(read).reshape(len(words), len(table)).T
+
+        return cls(
+            table.numbers("time"),
+            columns([f"{name}_measured" for name in names.outputs], finite=False),
+            columns([f"{name}_reference" for name in names.outputs]),
+            columns(list(names.disturbances)),
+            columns(list(names.inputs)),
+            table.numbers("objective", finite=False),
+            tuple(table.words("status")),
+            tuple(table.words("remarks")),
+            tuple(table.words("ignored")),
+            names,
+        )
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first decision that did not come out as recorded."""
+
+    sample: int
+    time: float
+    quantity: str
+    recorded: str
+    replayed: str
+
+    def __str__(self) -> str:
+        return (
+            f"sample {self.sample} (t = {self.time:g} s): {self.quantity} was {self.recorded}, "
+            f"and is {self.replayed} now"
+        )
+
+
+def replay(
+    regulator: Regulator,
+    state: RegulatorState,
+    recording: Recording,
+    *,
+    preview: bool = False,
+    tolerance: float = SAME_DECISION,
+) -> Difference | None:
+    """Decide again on what was recorded, and find the first decision that differs.
+
+    Args:
+        regulator: a new one, as it was then.
+        state: from which the recording began.
+        recording: what the regulator was told and decided.
+        preview: whether it saw the reference over its horizon.
+        tolerance: of times, inputs and objectives, relative to their size (at least one unit); 0 for the same bits.
+
+    Returns:
+        None if every decision came out as recorded.
+    """
+    tolerance = as_number("tolerance", tolerance, 0.0)
+    model, l = regulator.controller.problem.model, recording.y.shape[1]
+    m, d = recording.u.shape[1], recording.v.shape[1]
+    if (m, l) != (model.n_inputs, model.n_outputs) or model.n_disturbances not in (0, d):
+        raise MampcError(
+            f"replay: expected a recording of {model.n_inputs} inputs, {model.n_outputs} outputs and "
+            f"{model.n_disturbances} measured disturbances, received {m}, {l} and {d}"
+        )
+    horizon = regulator.controller.problem.prediction_horizon
+    for k, t in enumerate(recording.t.tolist()):
+        ahead = np.minimum(np.arange(k, k + horizon + 1), len(recording.t) - 1)
+        decision = regulator.step(
+            state,
+            recording.y[k],
+            recording.r[ahead] if preview else recording.r[k],
+            measured_disturbance=recording.v[k] if model.n_disturbances else None,
+        )
+        state = decision.state
+        for name, said, says in (
+            ("the status", recording.status[k], decision.status.value),
+            ("the remarks", recording.remarks[k], told(decision)["remarks"]),
+            ("the ignored outputs", recording.ignored[k], told(decision)["ignored"]),
+        ):
+            if said != says:
+                return Difference(k, t, name, said or "none", says or "none")
+        for name, was, now in (
+            ("the time", t, k * model.dt),
+            *zip(recording.names.inputs, recording.u[k].tolist(), decision.u.tolist(), strict=True),
+            ("the objective", float(recording.objective[k]), decision.objective),
+        ):
+            both_unknown = was != was and now != now
+            if not (both_unknown or abs(now - was) <= tolerance * max(1.0, abs(was))):
+                return Difference(k, t, name, repr(was), repr(float(now)))
+    return None

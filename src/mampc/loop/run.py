@@ -1,0 +1,111 @@
+"""A closed-loop run: what came of a plant, a regulator and a reference."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.base.files import written_whole
+from mampc.base.names import Names
+from mampc.controllers.decision import Decision
+from mampc.loop import metrics
+from mampc.loop.metrics import Metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A closed-loop run of T samples, in engineering units.
+
+    Attributes:
+        t: time in seconds, shape (T,).
+        u: applied inputs, shape (T, m); u[k] acts from t[k] on.
+        y: true outputs at t[k], shape (T, l), without measurement noise.
+        y_measured: what the regulator saw, shape (T, l).
+        r: reference, shape (T, l).
+        u_initial: inputs before the first sample, shape (m,).
+        decisions: the regulator's decisions, with their states left out.
+        v: measured disturbances, shape (T, d).
+        faults: sample -> what took the plant out of its range there (see `Plant`); empty if nothing did.
+        dt: sample time in seconds.
+        names: of the inputs and outputs.
+    """
+
+    t: Array
+    u: Array
+    y: Array
+    y_measured: Array
+    r: Array
+    u_initial: Array
+    decisions: tuple[Decision, ...] = field(repr=False)
+    dt: float
+    names: Names
+    v: Array
+    faults: dict[int, tuple[str, ...]]
+
+    def metrics(self, *, threshold: float = 0.1, skip: int = 0) -> Metrics:
+        """How often the inputs move and how well the outputs follow; see `Metrics`."""
+        return metrics.compute(
+            self.u, self.y, self.r, self.u_initial, self.dt, threshold=threshold, skip=skip
+        )
+
+    @property
+    def solve_times(self) -> Array:
+        """Seconds per step, shape (T,)."""
+        return np.array([decision.solve_time for decision in self.decisions])
+
+    @property
+    def gaps(self) -> Array:
+        """How much each plan may cost more than the best one, as a share of its own cost, shape (T,).
+
+        0 where it is proven best, infinite where nothing is proven, not-a-number where inputs were held.
+        """
+        objective = np.array([decision.objective for decision in self.decisions])
+        gap = np.array([decision.gap for decision in self.decisions])
+        shares: Array = np.where(gap > 0, gap / np.maximum(np.abs(objective), 1e-12), gap)
+        return np.where(np.isnan(objective), np.nan, shares)
+
+    @property
+    def statuses(self) -> dict[str, int]:
+        """How often each status came."""
+        return dict(Counter(decision.status.value for decision in self.decisions))
+
+    def plot(self) -> Figure:
+        """Inputs as staircases above outputs with their references; needs mampc[plot]."""
+        from mampc.loop.drawing import closed_loop_figure
+
+        return closed_loop_figure(self.t, self.u, self.y, self.r, self.names)
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write time, inputs, measured disturbances, outputs, references, status, remarks and ignored outputs, in
+        full precision.
+        """
+        inputs, outputs = self.names.inputs, self.names.outputs
+        header = [
+            "time", *inputs, *self.names.disturbances, *outputs,
+            *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
+            "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored",
+        ]  # fmt: skip
+        numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
+        with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            for row, d in zip(numbers, self.decisions, strict=True):
+                writer.writerow([
+                    *row, d.status.value, d.objective, d.lower_bound, d.iterations,
+                    round(d.solve_time * 1e6, 2), *told(d).values(),
+                ])  # fmt: skip
+
+
+def told(decision: Decision) -> dict[str, str]:
+    """What a decision says beside its numbers and its status, by column of a file."""
+    ignored = " ".join(f"{y}:{fault}" for y, fault in decision.ignored_outputs.items())
+    return {"remarks": " ".join(decision.remarks), "ignored": ignored}

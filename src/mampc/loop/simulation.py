@@ -1,0 +1,182 @@
+"""The closed loop: a plant, a regulator, a reference; and the run that comes of them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_array, as_matrix, as_vector, as_whole
+from mampc.base.errors import MampcError
+from mampc.loop.regulator import Regulator
+from mampc.loop.run import Run
+from mampc.loop.state import RegulatorState
+from mampc.plants import Plant, advance
+from mampc.systems.state_space import StateSpace
+
+if TYPE_CHECKING:
+    pass
+
+
+def simulate(
+    plant: Plant | StateSpace,
+    regulator: Regulator,
+    reference: Any,
+    *,
+    steps: int | None = None,
+    noise: Any = 0.0,
+    seed: int = 0,
+    preview: bool = False,
+    input_disturbance: Any = None,
+    output_disturbance: Any = None,
+    measured_disturbance: Any = None,
+    u_initial: Any = None,
+    progress: bool | None = None,
+) -> Run:
+    """Run a regulator on a plant that starts at rest.
+
+    Args:
+        plant: a nonlinear plant, or a discrete `StateSpace` standing in for one.
+        regulator: output feedback; its model's sample time is that of the loop.
+        reference: absolute outputs to track: constant (l,), or one row per sample (T, l).
+        steps: T; default the rows of the reference.
+        noise: standard deviation of Gaussian measurement noise, scalar or (l,), in output units.
+        seed: of the noise; equal seeds give equal noise whatever the regulator.
+        preview: let the regulator see the reference over its prediction horizon.
+        input_disturbance: unmeasured, added to the inputs on their way to the plant, (m,) or (T, m).
+        output_disturbance: unmeasured, added to the true outputs, (l,) or (T, l).
+        measured_disturbance: of the plant, and told to the regulator if its model has it, (d,) or (T, d);
+            default the plant's usual ones (its `v_op`).
+        u_initial: inputs at the start, shape (m,); default the plant's usual ones (its `u_op`).
+        progress: show a progress bar on the terminal; default: when the run is long.
+
+    Raises:
+        MampcError: arguments that do not fit together, or a plant that cannot be integrated.
+    """
+    model = regulator.controller.problem.model
+    m, l, d = model.n_inputs, model.n_outputs, len(plant.names.disturbances)
+    if (len(plant.names.inputs), len(plant.names.outputs)) != (m, l) or model.n_disturbances not in (0, d):
+        raise MampcError(
+            f"simulate: expected a plant with {m} inputs, {l} outputs and {model.n_disturbances} measured "
+            f"disturbances, received {len(plant.names.inputs)}, {len(plant.names.outputs)} and {d}"
+        )
+    T = _length(reference, steps)
+    rows = _trajectory("reference", reference, l, None if np.ndim(reference) == 2 else T)
+    horizon = regulator.controller.problem.prediction_horizon
+    known = rows[np.minimum(np.arange(T + horizon), len(rows) - 1)]
+    r = known[:T]
+    spread = as_vector("noise", noise, l)
+    if (spread < 0).any():
+        raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
+    wobble = spread * np.random.default_rng(as_whole("seed", seed, 0)).standard_normal((T, l))
+    at_inputs = _trajectory("input_disturbance", _default(input_disturbance, 0.0), m, T)
+    at_outputs = _trajectory("output_disturbance", _default(output_disturbance, 0.0), l, T)
+    usual = getattr(plant, "v_op", np.zeros(d))
+    v = _trajectory("measured_disturbance", _default(measured_disturbance, usual), d, T)
+    start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
+
+    output, move, faults = _sampled(plant, model.dt)
+    told: list[dict[str, Any]] = [{"measured_disturbance": now} if model.n_disturbances else {} for now in v]
+    x, state = at_rest(plant, regulator, start, v[0])
+    inputs, outputs, decisions, found = np.empty((T, m)), np.empty((T, l)), [], {}
+    u = start
+    for k in _watched(T, progress):
+        outputs[k] = output(x, np.concatenate([u + at_inputs[k], v[k]])) + at_outputs[k]
+        ahead = known[k : k + horizon + 1] if preview else r[k]
+        decision = regulator.step(state, outputs[k] + wobble[k], ahead, **told[k])
+        state, u = decision.state, decision.u
+        inputs[k] = u
+        decisions.append(replace(decision, state=None))
+        x = move(x, np.concatenate([u + at_inputs[k], v[k]]))
+        wrong = faults(x, np.concatenate([u + at_inputs[k], v[k]]))
+        if wrong:
+            found[k] = wrong
+    return Run(
+        t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + wobble, r=r, u_initial=start,
+        decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found,
+    )  # fmt: skip
+
+
+def at_rest(
+    plant: Plant | StateSpace, regulator: Regulator, u: Array, v: Array
+) -> tuple[Array, RegulatorState]:
+    """The states of plant and regulator before the first sample, at rest under inputs u (m,) and measured
+    disturbances v (d,).
+    """
+    model, both = regulator.controller.problem.model, np.concatenate([u, v])
+    x = plant.steady_state(both)
+    y = _sampled(plant, model.dt)[0](x, both)
+    told = {"measured_disturbance": v} if model.n_disturbances else {}
+    return x, regulator.initial_state(u, y, **told)
+
+
+def _length(reference: Any, steps: int | None) -> int:
+    if steps is not None:
+        return as_whole("steps", steps, 1)
+    if np.ndim(reference) != 2:
+        raise MampcError(
+            "steps: expected a number of samples, since the reference is constant, received none"
+        )
+    return len(reference)
+
+
+def _default(value: Any, otherwise: Any) -> Any:
+    return otherwise if value is None else value
+
+
+def _sampled(plant: Plant | StateSpace, dt: float) -> tuple[Any, Any, Any]:
+    """The plant's output, its motion over one sample, and what is wrong with it."""
+    if not isinstance(plant, StateSpace):
+        faults = getattr(plant, "faults", lambda x, u: ())
+        return plant.output, lambda x, u: advance(plant, x, u, dt), faults
+    if not np.isclose(plant.dt, dt, rtol=1e-6):
+        raise MampcError(f"simulate: expected a plant sampled every {dt:g} s, received {plant.dt:g} s")
+    A, B, C, D, op, y_op = plant.A, plant.B, plant.C, plant.D, plant.all_inputs_op, plant.y_op
+    return (
+        lambda x, u: y_op + C @ x + D @ (u - op),
+        lambda x, u: A @ x + B @ (u - op),
+        lambda x, u: (),
+    )
+
+
+def _trajectory(name: str, value: Any, width: int, steps: int | None) -> Array:
+    """One row per sample, from a constant or from rows of which the last is repeated."""
+    array = as_array(name, value)
+    if array.ndim < 2:
+        if steps is None:
+            raise MampcError(f"steps: expected a number of samples, since {name} is constant")
+        return np.tile(as_vector(name, array, width), (as_whole("steps", steps, 1), 1))
+    rows = as_matrix(name, array, None, width)
+    steps = len(rows) if steps is None else as_whole("steps", steps, 1)
+    if len(rows) == 0:
+        raise MampcError(f"{name}: expected at least one row, received none")
+    return rows[np.minimum(np.arange(steps), len(rows) - 1)]
+
+
+def _watched(steps: int, progress: bool | None) -> Any:
+    """0..steps-1, with a progress bar that shows itself once the run has taken two seconds."""
+    if progress is False:
+        return range(steps)
+    return _with_bar(steps, 0.0 if progress else 2.0)
+
+
+def _with_bar(steps: int, patience: float) -> Any:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    began, bar, task = time.perf_counter(), None, None
+    try:
+        for k in range(steps):
+            if bar is None and console.is_terminal and time.perf_counter() - began >= patience:
+                bar = Progress(console=console, transient=True)
+                bar.start()
+                task = bar.add_task("closed loop", total=steps, completed=k)
+            yield k
+            if bar is not None and task is not None:
+                bar.update(task, completed=k + 1)
+    finally:
+        if bar is not None:
+            bar.stop()

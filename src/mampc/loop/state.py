@@ -1,0 +1,90 @@
+"""What a regulator remembers between samples, and how it is kept as text."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_whole
+from mampc.base.errors import MampcError, shown
+from mampc.controllers.decision import ControllerState
+from mampc.loop.actuators import ActuatorState
+from mampc.loop.estimation import Estimate
+from mampc.loop.sensors import SensorState
+
+FORMAT = "mampc-regulator-state-1"
+
+
+@dataclass(frozen=True, eq=False)
+class RegulatorState:
+    """What a regulator remembers between samples; plain numbers, which JSON carries to the last bit.
+
+    Attributes:
+        controller: inputs applied so far, and where the method starts next.
+        estimate: state and disturbances, corrected with the last measurement.
+        measured_disturbance: as last told, shape (d,).
+        sensors: what the sensor checks remember.
+        actuators: what is remembered of the actuators.
+    """
+
+    controller: ControllerState
+    estimate: Estimate
+    measured_disturbance: Array
+    sensors: SensorState
+    actuators: ActuatorState
+
+    def to_json(self) -> str:
+        """The state as JSON text; `Regulator.state_from_json` gives the same numbers back."""
+        return json.dumps({"format": FORMAT, **asdict(self)}, default=np.ndarray.tolist)
+
+    @classmethod
+    def from_json(cls, text: str) -> RegulatorState:
+        """Read what `to_json` wrote; raises `MampcError` for other text and for numbers that are not finite."""
+        try:
+            content = json.loads(text)
+            if content.pop("format") != FORMAT:
+                raise MampcError(f"state: expected the format {FORMAT!r}")
+            numbers = {part: _numbers(part, values) for part, values in content.items()}
+            actuators = numbers.pop("actuators")
+            return cls(
+                ControllerState(**numbers.pop("controller")),
+                Estimate(**numbers.pop("estimate")),
+                sensors=SensorState(**numbers.pop("sensors")),
+                actuators=ActuatorState(tuple(actuators.pop("commands")), **actuators),
+                **numbers,
+            )
+        except MampcError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError):
+            raise MampcError(
+                f"state: expected what RegulatorState.to_json writes, received {shown(text)}"
+            ) from None
+
+    def shapes(self) -> dict[str, tuple[int, ...] | None]:
+        """The shape of every array, by its place; None where there is none."""
+        parts = {
+            "controller": self.controller, "estimate": self.estimate, "sensors": self.sensors,
+            "actuators": self.actuators,
+        }  # fmt: skip
+        places = {
+            f"{part}.{name}": value for part, held in parts.items() for name, value in vars(held).items()
+        }
+        places["measured_disturbance"] = self.measured_disturbance
+        return {place: None if value is None else np.shape(value) for place, value in places.items()}
+
+
+def _numbers(place: str, value: Any) -> Any:
+    """Lists of numbers as arrays; dictionaries entry by entry; counts and None as they are."""
+    if isinstance(value, dict):
+        return {name: _numbers(f"{place}.{name}", entry) for name, entry in value.items()}
+    if value is None:
+        return None
+    if not isinstance(value, list):
+        return as_whole(f"state: {place}", value, 0)
+    array = np.array(value, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise MampcError(f"state: expected finite numbers at {place}, received {value}")
+    return array

@@ -1,0 +1,198 @@
+"""The sparse problem solved exactly, with a proof.
+
+Every admissible pattern has a lower bound that needs no solver: its optimum without limits. Patterns are
+taken best bound first; where the optimum keeps every limit, it is the pattern's own and the search is over;
+otherwise a quadratic program on the pattern gives its best moves and, as a by-product, multipliers of the
+limits. Any multipliers turn the limits into a change of the linear term (Lagrangian relaxation), so that all
+patterns can be ranked again with limits priced in; so do those of programs in which more moves are free, plain
+MPC first. The search ends when no bound beats the best plan.
+
+Few patterns are listed in a table (`ranking`); more are searched as a tree (`tree`) by the same bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray, as_number
+from mampc.base.tolerances import INSIDE, TIE
+from mampc.base.words import Remark, Status
+from mampc.methods.exact.ranking import Ranking, ranking_of
+from mampc.methods.exact.relaxation import Relaxation
+from mampc.methods.exact.tree import PatternTree, Priced
+from mampc.methods.local_search import LocalSearch
+from mampc.methods.method import HELD_BY, Plan
+from mampc.moves.admissible import AdmissiblePatterns, Allowance
+from mampc.moves.pattern_solver import Incumbent, PatternSolver
+from mampc.moves.rules import MoveRules
+from mampc.program.condensing import CondensedQP
+from mampc.program.qp import QPStatus
+from mampc.program.sample import Sample
+
+TOGETHER = 3  # patterns of the table whose limits are priced together
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exact:
+    """Settings of the exact search.
+
+    Args:
+        time_limit: seconds a sample may take; then the best plan so far is given with a valid lower bound
+            and the status `time_limit`. Problems of some dozen moves take milliseconds; None searches on until
+            the optimum is proven, whatever it takes.
+    """
+
+    time_limit: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        if self.time_limit is not None:
+            as_number("time_limit", self.time_limit, 0.0, exclusive=True)
+
+    def prepare(self, condensed: CondensedQP, rules: MoveRules) -> ExactSearch:
+        """The search for one problem and one set of rules."""
+        return ExactSearch(self, condensed, rules)
+
+
+class ExactSearch:
+    """The exact search, prepared for one condensed problem."""
+
+    warm_up = 0
+
+    def __init__(self, settings: Exact, condensed: CondensedQP, rules: MoveRules) -> None:
+        problem = condensed.problem
+        self.settings, self.condensed = settings, condensed
+        self.admissible = AdmissiblePatterns(rules, problem.model.n_inputs, problem.control_horizon)
+        self._relaxation = Relaxation(condensed)
+        self._ranking = ranking_of(condensed, self.admissible)
+        # Ranking calls the solver only where the optimum without limits breaks one.
+        ranked = self._ranking is not None
+        self._solver = PatternSolver(condensed, self.admissible, limits_expected=ranked)
+        if self._ranking is None:
+            self._tree = PatternTree(condensed, self.admissible)
+            self._local = LocalSearch(condensed, self.admissible)
+
+    def plan(self, sample: Sample, inputs: Array, guess: Array | None = None) -> Plan:
+        """The best moves of all admissible patterns for one sample."""
+        past = self.admissible.past(inputs, sample.rest)
+        if past.exceeded:
+            return self._search(sample, past)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
+        return self._search(sample, past)
+
+    def _search(self, sample: Sample, past: Allowance) -> Plan:
+        ranking = self._ranking
+        if ranking is None:
+            return self._search_tree(sample, past)
+        bounds = ranking.bounds(sample.f_moves, past)
+        best = ranking.rows(past).start + int(bounds.argmin())
+        if not self.admissible.sized:
+            optimum = ranking.optimum(best, sample)
+            margins = optimum.margins
+            if not len(margins) or margins[margins.argmin()] > INSIDE:
+                return Plan(
+                    optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs,
+                    optimum.cost + float(ranking.charge[best]),
+                )  # fmt: skip
+        return self._search_ranking(ranking, bounds, sample, past)
+
+    def _deadline(self) -> float:
+        limit = self.settings.time_limit
+        return np.inf if limit is None else perf_counter() + 0.95 * limit
+
+    def _search_ranking(self, ranking: Ranking, bounds: Array, sample: Sample, past: Allowance) -> Plan:
+        """Patterns of the table best bound first, ranked again whenever the limits are priced anew."""
+        best, deadline, patterns = Incumbent(), self._deadline(), ranking.patterns[ranking.rows(past)]
+        tie = TIE * max(1e-6, sample.constant)
+        oracle = SampleOracle(self, sample, best, deadline, tie)
+        bounds += sample.constant
+
+        def rank_again(limits: Priced | None) -> None:
+            if limits is not None:
+                np.maximum(bounds, ranking.bounds(limits[0], past) + limits[1], out=bounds)
+
+        rank_again(oracle.of_plain())
+        solved = None
+        while True:
+            index = int(bounds.argmin())
+            bound = float(bounds[index])
+            if bound >= best.objective - tie or bound == np.inf:
+                return self._plan(sample, best, best.objective)
+            if perf_counter() > deadline:
+                return self._plan(sample, best, bound, Status.TIME_LIMIT)
+            if solved is not None:
+                rank_again(oracle.priced(solved.multipliers))
+                # Where this pattern does not move, its multipliers say little: price the best ones left together.
+                few = bounds.argpartition(min(TOGETHER, len(bounds) - 1))[:TOGETHER]
+                rank_again(oracle.relaxed(np.asarray(patterns[few].any(axis=0))))
+                solved = None
+                continue
+            solved = self._solver.solve(sample, patterns[index], best.objective, deadline)
+            best.offer(solved)
+            if solved.status is QPStatus.TIME_LIMIT:
+                return self._plan(sample, best, bound, Status.TIME_LIMIT)
+            bounds[index] = np.inf
+
+    def _search_tree(self, sample: Sample, past: Allowance) -> Plan:
+        """A good plan by local search, then the tree of everything that may beat it."""
+        best, deadline = Incumbent(), self._deadline()
+        tie = TIE * max(1e-6, sample.constant)
+        oracle = SampleOracle(self, sample, best, deadline, tie)
+        priced = [(sample.f_moves, sample.constant)]
+        if (limits := oracle.of_plain()) is not None:
+            priced.append(limits)
+        best.offer(self._solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool)))
+        self._local.offer(self._solver, sample, priced[-1][0], past, best, deadline)
+        if (limits := oracle.priced(best.multipliers)) is not None:
+            priced.append(limits)
+        open_bound = self._tree.search(priced, past, best.objective - tie, deadline, oracle)
+        if open_bound < best.objective - tie:
+            return self._plan(sample, best, open_bound, Status.TIME_LIMIT)
+        return self._plan(sample, best, best.objective)
+
+    def _plan(self, sample: Sample, best: Incumbent, bound: float, status: Status = Status.OPTIMAL) -> Plan:
+        if best.failure is not None:  # a pattern without an answer leaves the rest unproven
+            bound, status = -np.inf, Status.FEASIBLE
+        if best.moves is None:
+            if status is Status.OPTIMAL:
+                return Plan(None, Status.HELD_INFEASIBLE, best.solved)
+            if best.failure is not None:
+                return Plan(None, HELD_BY[best.failure], best.solved)
+            hold = np.zeros(self.condensed.n_moves)
+            if sample.present is not None and sample.present.on(hold != 0) is None:
+                return Plan(None, Status.HELD_INFEASIBLE, best.solved)
+            return Plan(hold, status, best.solved, bound)
+        lower = None if status is Status.OPTIMAL else min(bound, best.objective)
+        return Plan(best.moves, status, best.solved, lower, None, None, best.objective)
+
+
+class SampleOracle:
+    """One sample as the searches see it: patterns are solved for, and limits priced, on demand."""
+
+    def __init__(
+        self, search: ExactSearch, sample: Sample, best: Incumbent, deadline: float, tie: float
+    ) -> None:
+        self._condensed, self._solver, self._relaxation = search.condensed, search._solver, search._relaxation
+        self._instance, self._best, self._deadline, self._tie = sample, best, deadline, tie
+        self._relaxation.begin()
+
+    def leaf(self, pattern: BoolArray) -> tuple[float, Priced | None]:
+        solved = self._solver.solve(self._instance, pattern, self._best.objective, self._deadline)
+        self._best.offer(solved)
+        return self._best.objective - self._tie, self.priced(solved.multipliers)
+
+    def of_plain(self) -> Priced | None:
+        """The limits priced in that plain MPC runs into, if any."""
+        if not self._instance.margins.min(initial=np.inf) < 0:
+            return None
+        return self.priced(self._relaxation.of_plain(self._instance))
+
+    def relaxed(self, free: BoolArray) -> Priced | None:
+        return self.priced(self._relaxation.multipliers(self._instance, free))
+
+    def priced(self, multipliers: Array | None) -> Priced | None:
+        """The linear term and constant with limits priced in by multipliers, if any is not zero."""
+        if multipliers is None or not multipliers.any():
+            return None
+        return self._condensed.relaxed_limits(self._instance, multipliers)

@@ -1,0 +1,1 @@
+"""Move rules, the patterns they admit, and the program on one pattern."""

@@ -1,0 +1,222 @@
+"""The admissible patterns of `MoveRules`, given the moves already made.
+
+A pattern says for every future move du_j of every input whether it may differ from zero. Patterns are
+boolean arrays of shape (nc m,), time-major like the moves themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray, as_vector
+from mampc.base.errors import MampcError
+from mampc.base.tolerances import SAME
+from mampc.moves.rules import MoveRules
+
+
+class Allowance(NamedTuple):
+    """What the moves already made leave: moves of the budget, and samples each input must still rest."""
+
+    left: int
+    rest: tuple[int, ...]
+    exceeded: bool  # the window holds more moves than the budget already
+
+
+class AdmissiblePatterns:
+    """The admissible patterns of `MoveRules` for m inputs over nc samples.
+
+    Attributes:
+        candidates: moves that some admissible pattern holds, shape (n_moves,).
+        price: of each input, shape (m,); with simultaneous counting the price of a sample.
+        min_size: of each move, shape (n_moves,).
+        sized: whether any min_size is above zero.
+        simple: whether moves compete for the budget alone, one for one.
+    """
+
+    def __init__(self, rules: MoveRules, n_inputs: int, control_horizon: int) -> None:
+        self.rules, self.n_inputs, self.control_horizon = rules, n_inputs, control_horizon
+        m, n_c = n_inputs, control_horizon
+        self.n_moves = n_c * m
+        self.simultaneous = rules.counting == "simultaneous"
+        self.price = as_vector("price", rules.price, m)
+        self.priced = bool(self.price.any())
+        self.min_size: Array = np.tile(as_vector("min_size", rules.min_size, m), n_c)
+        self.sized = bool(self.min_size.any())
+        self.per_step = m if rules.max_moves_per_step is None else min(m, rules.max_moves_per_step)
+        starts = np.ones(n_c, dtype=bool)
+        if rules.blocks is not None:
+            if sum(rules.blocks) > n_c:
+                raise MampcError(
+                    f"blocks: expected lengths that sum to at most the control horizon of {n_c}, "
+                    f"received {rules.blocks}"
+                )
+            starts[:] = False
+            starts[np.cumsum([0, *rules.blocks[:-1]])] = True
+        self.candidates: BoolArray = np.repeat(starts, m)
+        self.simple = rules.dwell == 1 and self.per_step == m and not self.simultaneous
+        self._most = n_c if self.simultaneous else self.n_moves
+        self._at_rest = (0,) * m
+
+    @property
+    def unrestricted(self) -> bool:
+        """Whether there are no rules at all: every pattern is admissible, at no price and with moves of any size."""
+        free = self.rules.max_moves is None and self.rules.dwell == 1 and self.per_step == self.n_inputs
+        return free and bool(self.candidates.all()) and not self.priced and not self.sized
+
+    def past(self, inputs: Array, resting: Any = None) -> Allowance:
+        """What the applied inputs, shape (h, m) with the latest last, leave.
+
+        `resting`: samples that each input has to rest for besides, shape (m,), or None.
+        """
+        rules = self.rules
+        left, exceeded, rest = self._most, False, self._at_rest
+        if rules.max_moves is not None:
+            left = rules.max_moves
+            if rules.sparsity_horizon > 1:
+                left -= self._count(_moved(inputs[-rules.sparsity_horizon :]))
+                exceeded = left < 0
+            left = min(max(left, 0), self._most)
+        if rules.dwell > 1:
+            moved = _moved(inputs[-rules.dwell :])[::-1]  # moved[t]: t + 1 samples before the next decision
+            since = np.where(moved.any(axis=0), moved.argmax(axis=0) + 1, rules.dwell)
+            rest = tuple((rules.dwell - since).tolist())
+        if resting is not None:
+            rest = tuple(np.maximum(resting, rest).tolist())
+        return Allowance(left, rest, exceeded)
+
+    def open(self, past: Allowance) -> BoolArray:
+        """The moves that neither blocks nor rest forbid, shape (n_moves,)."""
+        if not any(past.rest):
+            return self.candidates
+        j = np.arange(self.n_moves) // self.n_inputs
+        return self.candidates & (j >= np.tile(past.rest, self.control_horizon))
+
+    def count(self, pattern: BoolArray) -> int:
+        """How many moves a pattern, shape (n_moves,), holds, as budget and price count them."""
+        return self._count(pattern.reshape(-1, self.n_inputs))
+
+    def _count(self, moved: BoolArray) -> int:
+        return int(np.count_nonzero(moved.any(axis=1) if self.simultaneous else moved))
+
+    def charge(self, pattern: BoolArray) -> float:
+        """The price of a pattern, shape (n_moves,)."""
+        if not self.priced:
+            return 0.0
+        moved = pattern.reshape(-1, self.n_inputs)
+        if self.simultaneous:
+            return float(self.price[0] * moved.any(axis=1).sum())
+        return float(moved.sum(axis=0) @ self.price)
+
+    def allows(self, pattern: BoolArray, past: Allowance) -> bool:
+        """Whether a pattern, shape (n_moves,), is admissible."""
+        builder = PatternBuilder(self, past)
+        return all(builder.add(int(i)) for i in np.flatnonzero(pattern))
+
+    def select(self, worth: Array, past: Allowance) -> BoolArray:
+        """A pattern of large total worth less price, shape (n_moves,): best moves first, as rules allow.
+
+        The best pattern under budgets, prices and limits per sample; a greedy choice where dwell times bind.
+        """
+        m, builder = self.n_inputs, PatternBuilder(self, past)
+        worth = np.where(self.open(past), worth, 0.0)
+        if self.simple:
+            rank = worth - np.tile(self.price, self.control_horizon)
+            pattern = np.zeros(self.n_moves, dtype=bool)
+            pattern[np.argsort(-rank, kind="stable")[: past.left]] = True
+            return pattern & (rank > 0)
+        if self.simultaneous:
+            by_sample = worth.reshape(-1, m)
+            kept = by_sample if self.per_step == m else np.sort(by_sample, axis=1)[:, -self.per_step :]
+            rank = np.repeat(kept.sum(axis=1), m)
+            order = np.lexsort((-worth, np.arange(self.n_moves) // m, -rank))
+        else:
+            rank = worth - np.tile(self.price, self.control_horizon)
+            order = np.argsort(-rank, kind="stable")
+        threshold = self.price[0] if self.simultaneous else 0.0
+        for i in order.tolist():
+            if builder.full or rank[i] <= threshold:
+                break
+            if worth[i] > 0:
+                builder.add(i)
+        if self.simultaneous and self.rules.dwell > 1:  # a sample may have got less than it was ranked by
+            got = (worth * builder.pattern).reshape(-1, m).sum(axis=1)
+            builder.pattern &= np.repeat(got > threshold, m)
+        return builder.pattern
+
+    def listed(self, most: int) -> BoolArray | None:
+        """All patterns admissible from rest, shape (K, n_moves); None if there are more than `most`."""
+        found: list[list[int]] = []
+        past = Allowance(
+            self._most if self.rules.max_moves is None else min(self.rules.max_moves, self._most),
+            self._at_rest,
+            False,
+        )
+        for chosen in self._grown([], np.flatnonzero(self.candidates).tolist(), PatternBuilder(self, past)):
+            found.append(chosen)
+            if len(found) > most:
+                return None
+        patterns = np.zeros((len(found), self.n_moves), dtype=bool)
+        for row, chosen in zip(patterns, found, strict=True):
+            row[chosen] = True
+        return patterns
+
+    def _grown(self, chosen: list[int], further: list[int], builder: PatternBuilder) -> Iterator[list[int]]:
+        yield chosen
+        for at, i in enumerate(further):
+            if builder.add(i):
+                yield from self._grown([*chosen, i], further[at + 1 :], builder)
+                builder.remove(i)
+
+
+class PatternBuilder:
+    """A pattern to which moves are added one by one, as long as the rules allow."""
+
+    def __init__(self, admissible: AdmissiblePatterns, past: Allowance) -> None:
+        self._of, self._past = admissible, past
+        self.pattern: BoolArray = np.zeros(admissible.n_moves, dtype=bool)
+        self._at = [0] * admissible.control_horizon  # moves at each sample
+        self._when: list[list[int]] = [[] for _ in range(admissible.n_inputs)]  # samples at which each moves
+        self._used = 0
+
+    @property
+    def full(self) -> bool:
+        """Whether the budget is spent (with simultaneous counting, samples that move may still hold more)."""
+        return self._used >= self._past.left and not self._of.simultaneous
+
+    def add(self, i: int) -> bool:
+        """Add move i if that is admissible; says whether it was."""
+        of, past = self._of, self._past
+        j, a = divmod(i, of.n_inputs)
+        counts = not of.simultaneous or self._at[j] == 0
+        dwell = of.rules.dwell
+        if (
+            self.pattern[i]
+            or (counts and self._used >= past.left)
+            or self._at[j] >= of.per_step
+            or not of.candidates[i]
+            or j < past.rest[a]
+            or (dwell > 1 and any(abs(j - other) < dwell for other in self._when[a]))
+        ):
+            return False
+        self.pattern[i] = True
+        self._at[j] += 1
+        self._when[a].append(j)
+        self._used += counts
+        return True
+
+    def remove(self, i: int) -> None:
+        """Take move i out again."""
+        j, a = divmod(i, self._of.n_inputs)
+        self.pattern[i] = False
+        self._at[j] -= 1
+        self._when[a].remove(j)
+        self._used -= not self._of.simultaneous or self._at[j] == 0
+
+
+def _moved(inputs: Array) -> BoolArray:
+    """Which inputs changed between successive rows, shape (h - 1, m)."""
+    moved: BoolArray = np.abs(inputs[1:] - inputs[:-1]) > SAME
+    return moved

@@ -1,0 +1,88 @@
+"""Move rules: which patterns of future moves are admissible, given the moves already made.
+
+A pattern says for every future move du_j of every input whether it may differ from zero. Patterns are
+boolean arrays of shape (nc m,), time-major like the moves themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_array, as_whole, require_finite
+from mampc.base.errors import MampcError
+
+COUNTINGS = ("elementwise", "simultaneous")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoveRules:
+    """What moves cost, and which patterns of moves are allowed; the rules combine.
+
+    The window of the budget holds the sparsity_horizon - 1 latest past changes and the nc future ones
+    (the paper's P0), so that no window of sparsity_horizon samples ever holds more than max_moves.
+
+    Args:
+        max_moves: s >= 0, how many moves the window may hold; None for no budget.
+        sparsity_horizon: ns >= 1, how many past inputs the window holds.
+        price: >= 0, added to the objective for every future move; a scalar or one per input. The unit is
+            that of the tracking cost.
+        counting: "elementwise" counts every change of a single input, "simultaneous" the samples at
+            which any input changes (and then has one price). Budget and price count alike.
+        min_size: >= 0, in input units; a move is zero or at least this large. A scalar or one per input.
+        dwell: >= 1, samples an input keeps a new value for at least; 1 allows a move at every sample.
+        max_moves_per_step: >= 1, how many inputs may move at one sample; None for all.
+        blocks: a fixed blocking pattern, lengths in samples: moves are allowed only at the first sample of
+            each block of the control horizon, such as (1, 2, 2): at j = 0, 1 and 3. The sum is at most nc;
+            after the last block the inputs stay.
+
+    Raises:
+        MampcError: values out of range.
+    """
+
+    max_moves: int | None = None
+    sparsity_horizon: int = 1
+    price: Any = 0.0
+    counting: str = "elementwise"
+    min_size: Any = 0.0
+    dwell: int = 1
+    max_moves_per_step: int | None = None
+    blocks: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_moves is not None:
+            as_whole("max_moves", self.max_moves, 0)
+        as_whole("sparsity_horizon", self.sparsity_horizon, 1, 10_000)
+        if self.counting not in COUNTINGS:
+            raise MampcError(f"counting: expected one of {COUNTINGS}, received {self.counting!r}")
+        as_whole("dwell", self.dwell, 1, 10_000)
+        if self.max_moves_per_step is not None:
+            as_whole("max_moves_per_step", self.max_moves_per_step, 1)
+        for name in ("price", "min_size"):
+            given = getattr(self, name)
+            value = require_finite(name, as_array(name, given))
+            if value.ndim > 1 or (value < 0).any():
+                raise MampcError(f"{name}: expected one value >= 0 or one per input, received {given!r}")
+            # Plain numbers: out of the caller's reach, and comparable.
+            object.__setattr__(self, name, tuple(value.tolist()) if value.ndim else float(value))
+        if self.counting == "simultaneous" and np.ndim(self.price):
+            raise MampcError(
+                "price: expected one price per sample with counting='simultaneous', received one per input"
+            )
+        if self.blocks is not None:
+            lengths = self.blocks if np.iterable(self.blocks) else [self.blocks]
+            object.__setattr__(self, "blocks", tuple(as_whole("blocks", length, 1) for length in lengths))
+            if not self.blocks:
+                raise MampcError("blocks: expected at least one block, received none")
+
+    def past_changes(self, inputs: Array) -> Array:
+        """Changes inside the window between the applied inputs (h, m), shape (ns - 1, m)."""
+        changes: Array = np.diff(inputs[-self.sparsity_horizon :], axis=0)
+        return changes
+
+    @property
+    def memory(self) -> int:
+        """How many past inputs the rules look back on."""
+        return max(self.sparsity_horizon, self.dwell)

@@ -1,0 +1,1 @@
+"""The tracking problem and its condensed quadratic program."""

@@ -1,0 +1,134 @@
+"""The tracking problem: what is predicted, how far, at what weights and within what limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import as_limit, as_number, as_weight, as_whole
+from mampc.base.errors import MampcError
+from mampc.systems.state_space import StateSpace
+
+MOST_PREDICTIONS = 5000  # future values of all outputs together; their weights take the square of it
+MOST_MOVES = 1000  # future moves of all inputs together
+LONGEST_HORIZON = 2000  # samples; a condensed problem beyond it is a mistake rather than a wish
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Limits in engineering units, each None, a scalar or one value per signal.
+
+    Args:
+        u_min, u_max: bounds of the inputs, always kept.
+        du_max: largest change of each input from one sample to the next, always kept.
+        y_min, y_max: bounds of the outputs, kept where possible (see `TrackingProblem`).
+    """
+
+    u_min: Any = None
+    u_max: Any = None
+    du_max: Any = None
+    y_min: Any = None
+    y_max: Any = None
+
+    def checked(self, n_inputs: int, n_outputs: int) -> Limits:
+        """The same limits as arrays, infinite where there is none; raises `MampcError` if they cross."""
+        limits = Limits(
+            u_min=as_limit("u_min", self.u_min, n_inputs, -np.inf),
+            u_max=as_limit("u_max", self.u_max, n_inputs, np.inf),
+            du_max=as_limit("du_max", self.du_max, n_inputs, np.inf),
+            y_min=as_limit("y_min", self.y_min, n_outputs, -np.inf),
+            y_max=as_limit("y_max", self.y_max, n_outputs, np.inf),
+        )
+        for low, high in (("u_min", "u_max"), ("y_min", "y_max")):
+            lower, upper = getattr(limits, low), getattr(limits, high)
+            if (lower > upper).any():
+                raise MampcError(f"limits: expected {low} <= {high}, received {lower} and {upper}")
+        if (limits.du_max < 0).any():
+            raise MampcError(f"limits: expected du_max >= 0, received {limits.du_max}")
+        for name in ("u_min", "u_max", "du_max", "y_min", "y_max"):
+            getattr(limits, name).flags.writeable = False
+        return limits
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingProblem:
+    """Track references with a linear model over a receding horizon (the paper's eqs. 1 to 3).
+
+        minimise   sum_{i=0..np} |r_i - y_i|^2_Q + sum_{j=0..nc-1} |du_j|^2_R + penalty(y limits) [+ tail]
+        subject to u_min <= u_j <= u_max, |du_j| <= du_max     j = 0..nc-1
+                   y_min - rho_i e <= y_i <= y_max + rho_i e   i = 1..np
+
+    with du_j = u_j - u_{j-1} and the input held at its last value beyond the control horizon. The
+    violation e >= 0, one value per output for the whole horizon, costs w (a + a^2 / 2) with a = sqrt(q) e, q
+    being the output's own weight (at least R of the input that moves it most cheaply): an exact penalty,
+    zero whenever the limits can be kept and w is large enough. rho falls evenly from 1 at i = 1 to 1/2 at np, so
+    that an output that is outside already is worth bringing back.
+
+    Args:
+        model: a discrete-time `StateSpace`.
+        prediction_horizon: np >= 1, in samples.
+        control_horizon: nc, 1 <= nc <= np, in samples.
+        output_weight: Q; a scalar, one value per output, or an (l, l) matrix.
+        move_weight: R (the paper's lambda); a scalar, one value per input, or an (m, m) matrix.
+        limits: input, move and output limits, in engineering units.
+        weigh_first_move: False leaves du_0 without weight, as the paper prints it (sum from j = 1).
+        output_limit_weight: w, up to 1e8: how many times tracking a violation counts.
+        tail_horizon: L >= 0, in samples. Beyond the prediction horizon, inputs held, errors go on to count,
+            weighted gamma, gamma^2, ... with gamma = L / (1 + L), so that an error that stays costs L
+            samples more. With prices it decides how long an offset is looked at (see docs/methods.md).
+
+    Raises:
+        MampcError: anything that does not fit the model or the horizons.
+    """
+
+    model: StateSpace
+    prediction_horizon: int = field(kw_only=True)
+    control_horizon: int = field(kw_only=True)
+    output_weight: Any = field(default=1.0, kw_only=True)
+    move_weight: Any = field(default=0.1, kw_only=True)
+    limits: Limits = field(default=Limits(), kw_only=True)
+    weigh_first_move: bool = field(default=True, kw_only=True)
+    output_limit_weight: float = field(default=1e4, kw_only=True)
+    tail_horizon: float = field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.model, StateSpace):
+            raise MampcError(f"model: expected a mampc.StateSpace, received {type(self.model).__name__}")
+        if not self.model.is_discrete:
+            raise MampcError("model: expected a discrete model, received dt = 0; use model.discretise(dt)")
+        n_p = as_whole("prediction_horizon", self.prediction_horizon, 1, LONGEST_HORIZON)
+        n_c = as_whole("control_horizon", self.control_horizon, 1, LONGEST_HORIZON)
+        if n_c > n_p:
+            raise MampcError(
+                f"control_horizon: expected at most the prediction horizon of {n_p}, received {n_c}"
+            )
+        m, l = self.model.n_inputs, self.model.n_outputs
+        Q = as_weight("output_weight", self.output_weight, l)
+        if not isinstance(self.limits, Limits):
+            raise MampcError(f"limits: expected mampc.Limits, received {type(self.limits).__name__}")
+        weight = as_number("output_limit_weight", self.output_limit_weight, 0.0, exclusive=True)
+        if weight > 1e8:
+            raise MampcError(f"output_limit_weight: expected at most 1e8, received {weight:g}")
+        if n_p * l > MOST_PREDICTIONS:
+            raise MampcError(
+                f"prediction_horizon: expected at most {MOST_PREDICTIONS} predicted outputs, "
+                f"received {n_p} x {l} outputs"
+            )
+        if n_c * m > MOST_MOVES:
+            raise MampcError(
+                f"control_horizon: expected at most {MOST_MOVES} future moves, received {n_c} x {m} inputs"
+            )
+        for name, value in {
+            "prediction_horizon": n_p,
+            "control_horizon": n_c,
+            "output_weight": Q,
+            "move_weight": as_weight("move_weight", self.move_weight, m),
+            "limits": self.limits.checked(m, l),
+            "output_limit_weight": weight,
+            "tail_horizon": as_number("tail_horizon", self.tail_horizon, 0.0),
+        }.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)

@@ -1,0 +1,176 @@
+"""One sample's data of the condensed program, and its optimum without limits on a pattern.
+
+All of it is affine in the sample's parameter p (see `condensing`), so that one matrix-vector product gives
+everything; the classes here are views into its result.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray
+from mampc.base.tolerances import KEPT
+
+Indices = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+
+class Parts(NamedTuple):
+    """Where each quantity stands in the data of an optimum or an sample."""
+
+    margins: slice
+    moves: slice
+    inputs: slice
+    residual: slice
+    f: slice = slice(0)
+    f_moves: slice = slice(0)
+    error: slice = slice(0)
+    lower: slice = slice(0)
+    upper: slice = slice(0)
+
+
+class Optimum:
+    """One sample's optimum without limits on some pattern, as views into one array.
+
+    How far it stays from each bound (negative where it breaks one), its moves d, its inputs
+    u_0 .. u_{nc-1}, and a vector whose squared length is its cost.
+    """
+
+    __slots__ = ("_margins", "data", "parts")
+
+    def __init__(self, data: Array, parts: Parts, margins: Array | None = None) -> None:
+        self.data, self.parts, self._margins = data, parts, margins
+
+    @property
+    def margins(self) -> Array:
+        return self.data[self.parts.margins] if self._margins is None else self._margins
+
+    @property
+    def moves(self) -> Array:
+        return self.data[self.parts.moves]
+
+    @property
+    def inputs(self) -> Array:
+        return self.data[self.parts.inputs]
+
+    @property
+    def cost(self) -> float:
+        residual = self.data[self.parts.residual]
+        return float(residual.dot(residual))
+
+
+class Sample(Optimum):
+    """One sample's data; symbols as in `condensing`. As an `Optimum`: that with every move free.
+
+    Attributes:
+        parameter: p.
+        u_previous: shape (m,).
+        rest: samples that each input may not move for, whatever the rules say, shape (m,); None for none.
+        present: the bounds, where they are those of this sample alone; else None.
+    """
+
+    __slots__ = ("_constant", "parameter", "present", "rest", "u_previous")
+
+    def __init__(
+        self,
+        data: Array,
+        parts: Parts,
+        parameter: Array,
+        u_previous: Array,
+        rest: Indices | None = None,
+        present: BoundsNow | None = None,
+    ) -> None:
+        self.data, self.parts, self.parameter, self.u_previous = data, parts, parameter, u_previous
+        self.rest, self.present = rest, present
+        self._margins: Array | None = None
+        self._constant: float | None = None
+        if present is not None:
+            data[parts.lower], data[parts.upper] = present.lower, present.upper
+            self._margins = present.margins(data[parts.moves])
+
+    @property
+    def f(self) -> Array:
+        """Linear term of the program, shape (n_variables,)."""
+        return self.data[self.parts.f]
+
+    @property
+    def f_moves(self) -> Array:
+        """Its entries for the moves, shape (n_moves,)."""
+        return self.data[self.parts.f_moves]
+
+    @property
+    def error(self) -> Array:
+        """Q^(1/2) (r - free), and the weighted tail, shape (n_errors,)."""
+        return self.data[self.parts.error]
+
+    @property
+    def constant(self) -> float:
+        """The cost of no moves: |error|^2."""
+        if self._constant is None:
+            error = self.data[self.parts.error]
+            self._constant = float(error.dot(error))
+        return self._constant
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds of the program, shape (n_bounds,)."""
+        return self.data[self.parts.lower]
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds of the program, shape (n_bounds,)."""
+        return self.data[self.parts.upper]
+
+
+class BoundsNow:
+    """The bounds of one sample, where inputs have limits that vary over the horizon.
+
+    Args:
+        lower, upper: bounds of the program, shape (n_bounds,).
+        bounded_rows: the bounded quantities per move, those of the violations left out.
+        low, high: least and largest u_j - u_previous, shape (nc, m).
+        bound_of_move: which bound limits the input after each move, shape (n_moves,); -1 for none.
+    """
+
+    def __init__(
+        self, lower: Array, upper: Array, bounded_rows: Array, low: Array, high: Array, bound_of_move: Indices
+    ) -> None:
+        self.lower, self.upper, self._rows = lower, upper, bounded_rows
+        self._low, self._high, self._bound_of_move = low, high, bound_of_move.reshape(low.shape)
+
+    def margins(self, moves: Array) -> Array:
+        """How far moves, shape (n_moves,), keep from each lower bound and, behind that, each upper one."""
+        rows, first = self._rows @ moves, len(self.lower) - len(self._rows)
+        return np.concatenate([rows - self.lower[first:], self.upper[first:] - rows])
+
+    def on(self, pattern: BoolArray) -> tuple[Array, Array] | None:
+        """The bounds for a pattern; None where it cannot keep them.
+
+        An input that does not move at some samples has to keep, from its last move on, the limits of all of
+        them.
+        """
+        lower, upper, moved = self.lower.copy(), self.upper.copy(), pattern.reshape(self._low.shape)
+        low, high = self._low[-1].copy(), self._high[-1].copy()
+        for j in range(len(moved) - 1, -1, -1):
+            low, high = np.maximum(low, self._low[j]), np.minimum(high, self._high[j])
+            now = moved[j]
+            at, known = self._bound_of_move[j][now], self._bound_of_move[j][now] >= 0
+            lower[at[known]], upper[at[known]] = low[now][known], high[now][known]
+            low[now], high[now] = -np.inf, np.inf
+        return (lower, upper) if (low <= KEPT).all() and (high >= -KEPT).all() else None
+
+
+class PatternOptimum:
+    """The optimum without limits on one pattern, ready to be evaluated sample by sample."""
+
+    def __init__(self, preview_map: Array, constant_map: Array, parts: Parts) -> None:
+        self._maps, self.parts = {m.shape[1]: m for m in (preview_map, constant_map)}, parts
+
+    def at(self, sample: Sample) -> Optimum:
+        """Its values for one sample; margins belong to the bounds that `CondensedQP.restricted` keeps, or
+        to all of them where they are this sample's own.
+        """
+        parameter, present = sample.parameter, sample.present
+        data = self._maps[len(parameter)].dot(parameter)
+        return Optimum(data, self.parts, None if present is None else present.margins(data[self.parts.moves]))

@@ -1,0 +1,362 @@
+"""Linear time-invariant models in state-space form, about an operating point.
+
+    x+ = A x + B (u - u_op)          (or dx/dt = ... in continuous time, dt = 0)
+    y  = y_op + C x + D (u - u_op)
+
+u and y are in engineering units; x is the deviation from the state at the operating point. Measured
+disturbances v, such as a load, are further inputs that no controller manipulates: their columns stand behind
+those of u in B and D.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from mampc.base.checks import Array, ComplexArray, as_array, as_matrix, as_number, as_vector
+from mampc.base.errors import MampcError
+from mampc.base.files import read_text, written_whole
+from mampc.base.names import Names, require_count
+
+MODEL_FILE_LIMIT = 8 * 2**20  # bytes; the largest model fits with room to spare
+MOST_SIGNALS = 200  # states of a model in a file, and inputs, and outputs; far beyond it, a study takes hours
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace:
+    """A linear model with its sample time, operating point and names.
+
+    Args:
+        A, B, C, D: shapes (n, n), (n, m + d), (l, n), (l, m + d); D = None means zeros.
+        dt: sample time in seconds, 0 for continuous time.
+        u_op, y_op: operating point in engineering units, shapes (m,), (l,); default zeros.
+        names: signal names; default u1.., y1.., x1.., and no measured disturbances (d = 0).
+        v_op: measured disturbances at the operating point, shape (d,); default zeros.
+
+    Raises:
+        MampcError: shapes that do not fit together, non-finite numbers, a negative dt.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float
+    u_op: Array = None  # type: ignore[assignment]  # always set after construction, as are the others
+    y_op: Array = None  # type: ignore[assignment]
+    names: Names = None  # type: ignore[assignment]
+    v_op: Array = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        A = as_matrix("A", self.A)
+        n = A.shape[0]
+        A = as_matrix("A", A, n, n)
+        B = as_matrix("B", self.B, n)
+        C = as_matrix("C", self.C, None, n)
+        columns, l = B.shape[1], C.shape[0]
+        names = Names.numbered(columns, l, n) if self.names is None else self.names
+        d = len(names.disturbances)
+        m = columns - d
+        if m <= 0 or l == 0:
+            raise MampcError(f"StateSpace: expected at least one input and output, received {m} and {l}")
+        D = np.zeros((l, columns)) if self.D is None else as_matrix("D", self.D, l, columns)
+        if not names.states:
+            names = replace(names, states=Names.numbered(m, l, n).states)
+        require_count("names.inputs", names.inputs, m)
+        require_count("names.outputs", names.outputs, l)
+        require_count("names.states", names.states, n)
+        checked = {
+            "A": A, "B": B, "C": C, "D": D, "names": names,
+            "dt": as_number("dt", self.dt, 0.0),
+            "u_op": as_vector("u_op", 0.0 if self.u_op is None else self.u_op, m),
+            "y_op": as_vector("y_op", 0.0 if self.y_op is None else self.y_op, l),
+            "v_op": as_vector("v_op", 0.0 if self.v_op is None else self.v_op, d),
+        }  # fmt: skip
+        for name, value in checked.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    @property
+    def n_states(self) -> int:
+        return len(self.A)
+
+    @property
+    def n_inputs(self) -> int:
+        """m, the manipulated inputs."""
+        return len(self.names.inputs)
+
+    @property
+    def n_disturbances(self) -> int:
+        """d, the measured disturbances."""
+        return len(self.names.disturbances)
+
+    @property
+    def all_inputs_op(self) -> Array:
+        """Inputs and measured disturbances at the operating point, shape (m + d,)."""
+        return np.concatenate([self.u_op, self.v_op])
+
+    @property
+    def n_outputs(self) -> int:
+        return len(self.C)
+
+    @property
+    def is_discrete(self) -> bool:
+        return self.dt > 0
+
+    def poles(self) -> ComplexArray:
+        """Eigenvalues of A, shape (n,)."""
+        return np.linalg.eigvals(self.A).astype(complex)
+
+    def is_stable(self) -> bool:
+        """All poles strictly inside the unit circle (in continuous time: the left half plane)."""
+        poles = self.poles()
+        return bool(np.all(np.abs(poles) < 1) if self.is_discrete else np.all(poles.real < 0))
+
+    def dc_gain(self) -> Array:
+        """Steady change of the outputs per unit change of each input, shape (l, m).
+
+        Raises:
+            MampcError: the model integrates, so that no finite gain exists.
+        """
+        shift = np.eye(self.n_states) if self.is_discrete else 0.0
+        singular = shift - self.A
+        if self.n_states and np.linalg.cond(singular) > 1e13:
+            raise MampcError(
+                "dc_gain: expected a model without integrators, received a pole at zero frequency"
+            )
+        gain: Array = self.C @ np.linalg.solve(singular, self.B) + self.D
+        return gain
+
+    def zeros(self) -> ComplexArray:
+        """Transmission zeros of a square model: generalised eigenvalues of its system matrix.
+
+        Source: Emami-Naeini and Van Dooren, Automatica 18 (1982), by way of the QZ algorithm.
+
+        Raises:
+            MampcError: unequal numbers of inputs and outputs.
+        """
+        n, m, l = self.n_states, self.n_inputs, self.n_outputs
+        if m != l:
+            raise MampcError(f"zeros: expected as many inputs as outputs, received {m} and {l}")
+        from scipy.linalg import eig
+
+        system = np.block([[self.A, self.B[:, :m]], [self.C, self.D[:, :m]]])
+        pencil = np.diag(np.repeat([1.0, 0.0], [n, m]))
+        alpha, beta = eig(system, pencil, right=False, homogeneous_eigvals=True)
+        finite = np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), 1e-300)
+        zeros: ComplexArray = alpha[finite] / beta[finite]
+        return zeros
+
+    def discretise(self, dt: float) -> StateSpace:
+        """The exact sampled model for inputs held constant over dt seconds (zero-order hold).
+
+        Source: Van Loan, IEEE Trans. Automatic Control 23 (1978): one matrix exponential.
+
+        Raises:
+            MampcError: the model is discrete already, or dt is not positive.
+        """
+        if self.is_discrete:
+            raise MampcError(f"discretise: expected a continuous model (dt = 0), received dt = {self.dt:g} s")
+        from scipy.linalg import expm
+
+        n, m = self.B.shape
+        block = np.zeros((n + m, n + m))
+        block[:n, :n], block[:n, n:] = self.A, self.B
+        held = expm(block * as_number("dt", dt, 0.0, exclusive=True))
+        return replace(self, A=held[:n, :n], B=held[:n, n:], dt=dt)
+
+    def steady_state(self, u: Any) -> Array:
+        """Deviation state x, shape (n,), at rest under constant inputs u, shape (m,) or (m + d,).
+
+        For an integrating model the least-norm solution; at the operating point always zeros. Measured
+        disturbances left out are those of the operating point.
+        """
+        inputs = as_array("u", u)
+        if inputs.shape == self.u_op.shape:
+            inputs = np.concatenate([inputs, self.v_op])
+        change = as_vector("u", inputs, self.B.shape[1]) - self.all_inputs_op
+        shift = np.eye(self.n_states) if self.is_discrete else np.zeros((self.n_states, self.n_states))
+        x: Array = np.linalg.lstsq(shift - self.A, self.B @ change)[0]
+        return x
+
+    def response(self, u: Any, x0: Any = None) -> Array:
+        """Outputs, shape (N, l), to the inputs u, shape (N, m + d), from the state x0 (default: at rest).
+
+        Raises:
+            MampcError: a continuous model, or inputs of another width.
+        """
+        if not self.is_discrete:
+            raise MampcError("response: expected a discrete model, received dt = 0; discretise it first")
+        du = as_matrix("u", u, None, self.B.shape[1]) - self.all_inputs_op
+        x = np.zeros(self.n_states) if x0 is None else as_vector("x0", x0, self.n_states)
+        drive, states = du @ self.B.T, np.empty((len(du), self.n_states))
+        for k in range(len(du)):
+            states[k] = x
+            x = self.A @ x + drive[k]
+        y: Array = states @ self.C.T + du @ self.D.T + self.y_op
+        return y
+
+    @classmethod
+    def from_any(cls, system: Any, dt: float | None = None) -> StateSpace:
+        """Build from a python-control or scipy.signal system, or a tuple (A, B, C, D[, dt]).
+
+        The libraries mark continuous time differently: dt = 0 in python-control, dt = None in
+        scipy.signal, no fifth entry (or None or 0) in a tuple. python-control's dt = True is discrete
+        time of unstated length and its dt = None leaves the kind of time open.
+
+        Args:
+            system: the object; transfer functions are realised by their own library.
+            dt: wanted sample time in seconds. A continuous system is sampled (zero-order hold), an
+                unstated sample time is taken to be this one, a stated one must agree.
+
+        Raises:
+            MampcError: an unknown kind of object, an unstated sample time and no dt, or a dt that differs.
+        """
+        if isinstance(system, StateSpace):
+            model = system
+        else:
+            A, B, C, D, own_dt = _matrices(system)
+            if own_dt is None and dt is None:
+                raise MampcError(
+                    "from_any: expected a sample time, received a system that states none; pass dt="
+                )
+            model = cls(A, B, C, D, dt if own_dt is None else own_dt)  # type: ignore[arg-type]
+        if dt is None or model.dt == dt:
+            return model
+        if not model.is_discrete:
+            return model.discretise(dt)
+        if np.isclose(model.dt, dt, rtol=1e-9):
+            return model
+        raise MampcError(
+            f"from_any: expected a sample time of {dt:g} s, received a system with {model.dt:g} s"
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as JSON, whole or not at all; `load` gives the same numbers back.
+
+        Raises:
+            MampcError: a model larger than `load` takes, or a file that cannot be written.
+        """
+        self._require_moderate(path)
+        arrays = ("A", "B", "C", "D", "u_op", "y_op", "v_op")
+        content = {
+            "format": "mampc-model-1",
+            "dt": self.dt,
+            **{k: np.asarray(getattr(self, k)).tolist() for k in arrays},
+            "names": {k: list(names) for k, names in asdict(self.names).items()},
+        }
+        with written_whole(path) as unfinished:
+            unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> StateSpace:
+        """Read a model written by `save`; raises `MampcError` for anything else."""
+        try:
+            content = json.loads(read_text(path, MODEL_FILE_LIMIT, "mampc model file"))
+        except MampcError:
+            raise
+        except (ValueError, RecursionError) as error:
+            raise MampcError(f"{path}: expected a mampc model file, received: {error}") from None
+        if not isinstance(content, dict) or content.get("format") != "mampc-model-1":
+            raise MampcError(f"{path}: expected a model file with format 'mampc-model-1'")
+        try:
+            names = Names(**{k: tuple(v) for k, v in content["names"].items()})
+            matrices = {k: content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")}
+            model = cls(**matrices, names=names, v_op=content.get("v_op", 0.0))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise MampcError(f"{path}: expected A, B, C, D, dt, u_op, y_op, names; {error!r}") from None
+        except MampcError as error:
+            raise MampcError(f"{path}: {error}") from None
+        model._require_moderate(path)
+        return model
+
+    def _require_moderate(self, path: str | Path) -> None:
+        largest = max(*self.B.shape, self.n_outputs)
+        if largest > MOST_SIGNALS:
+            raise MampcError(
+                f"{path}: expected a model of at most {MOST_SIGNALS} states, inputs and outputs each, "
+                f"received {self.n_states}, {self.B.shape[1]} and {self.n_outputs}; reduce its order"
+            )
+
+
+class Differentiable(Protocol):
+    """What `linearise` needs of a plant: dx/dt = derivative(x, u), y = output(x, u), a rest state."""
+
+    def derivative(self, x: Array, u: Array) -> Array: ...
+    def output(self, x: Array, u: Array) -> Array: ...
+    def steady_state(self, u: Any = None) -> Array: ...
+
+
+def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
+    """The continuous-time linear model of a plant about its steady state at inputs u.
+
+    Jacobians by central differences with steps of 1e-6 of each variable's size.
+
+    Args:
+        plant: with `derivative`, `output`, `steady_state`; its `names`, `u_op` and `v_op` (measured
+            disturbances) are used if it has them.
+        u: inputs at the operating point, shape (m,) or (m + d,); default the plant's.
+    """
+    given = getattr(plant, "u_op", None) if u is None else u
+    if given is None:
+        raise MampcError(f"linearise: expected inputs u, since {type(plant).__name__} has no u_op")
+    inputs = as_array("u", given)
+    names: Names | None = getattr(plant, "names", None)
+    m = len(inputs) if names is None else len(names.inputs)
+    if names is not None and len(inputs) == m:
+        inputs = np.concatenate([inputs, as_array("v_op", getattr(plant, "v_op", ()))])
+        names = names if len(inputs) > m else replace(names, disturbances=())
+    x_op = as_array("steady_state", plant.steady_state(inputs))
+
+    def jacobian(function: Any, point: Array) -> Array:
+        columns = []
+        for i, value in enumerate(point):
+            step = np.zeros_like(point)
+            step[i] = 1e-6 * max(1.0, abs(value))
+            columns.append((function(point + step) - function(point - step)) / (2 * step[i]))
+        return np.stack(columns, axis=-1)
+
+    return StateSpace(
+        A=jacobian(lambda x: plant.derivative(x, inputs), x_op),
+        B=jacobian(lambda v: plant.derivative(x_op, v), inputs),
+        C=jacobian(lambda x: plant.output(x, inputs), x_op),
+        D=jacobian(lambda v: plant.output(x_op, v), inputs),
+        dt=0.0,
+        u_op=inputs[:m],
+        y_op=plant.output(x_op, inputs),
+        names=names,  # type: ignore[arg-type]
+        v_op=inputs[m:],
+    )
+
+
+def _matrices(system: Any) -> tuple[Any, Any, Any, Any, float | None]:
+    """A, B, C, D and the sample time: 0 for continuous, None where the system leaves it open."""
+    origin = type(system).__module__.split(".")[0]
+    try:
+        if origin == "control":
+            if not hasattr(system, "A"):
+                import control
+
+                system = control.ss(system)
+            return system.A, system.B, system.C, system.D, _stated(system.dt)
+        if origin == "scipy" and hasattr(system, "to_ss"):
+            model = system.to_ss()
+            return model.A, model.B, model.C, model.D, 0.0 if model.dt is None else _stated(model.dt)
+        if isinstance(system, (tuple, list)) and len(system) in (4, 5):
+            return *system[:4], _stated(system[4] or 0.0) if len(system) == 5 else 0.0
+    except (TypeError, ValueError, NotImplementedError) as error:  # improper, or beyond the library
+        raise MampcError(f"from_any: expected a system with a state-space form, received: {error}") from None
+    raise MampcError(
+        "from_any: expected a python-control or scipy.signal system or (A, B, C, D[, dt]), "
+        f"received {type(system).__name__}"
+    )
+
+
+def _stated(dt: Any) -> float | None:
+    """A sample time, or None where a library's None or True leaves it open."""
+    return None if dt is None or dt is True else float(dt)
