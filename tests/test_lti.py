@@ -1,6 +1,7 @@
 """Linear models: what they accept, and agreement with python-control and scipy.signal."""
 
 import json
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -293,6 +294,40 @@ def test_from_its_steady_state_a_model_stays_at_its_gain():
     y = model.response(np.tile(u, (20, 1)), model.steady_state(u))
     expected = model.y_op + model.dc_gain() @ change
     np.testing.assert_allclose(y, np.broadcast_to(expected, y.shape), rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_step_response_is_that_of_a_simulation(seed):
+    model = random_model(seed, m=3, l=2)
+    model = replace(model, names=Names(("u1", "u2"), ("y1", "y2"), (), ("load",)), u_op=None, v_op=3.0)
+    response = model.step_response(30)
+    assert response.shape == (30, 2, 3)
+    for j in range(3):
+        stepped = model.response(np.tile(model.all_inputs_op + np.eye(3)[j], (30, 1)))
+        np.testing.assert_allclose(response[:, :, j], stepped - model.y_op, rtol=1e-10, atol=1e-12)
+
+
+def test_the_step_response_is_that_of_scipy_and_ends_at_the_gain():
+    model = random_model(5, m=2, l=2)
+    _, outputs = scipy.signal.dstep((model.A, model.B, model.C, model.D, model.dt), n=400)
+    response = model.step_response(400)
+    np.testing.assert_allclose(response, np.moveaxis(outputs, 0, 2), rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(response[-1], model.dc_gain(), rtol=1e-6, atol=1e-9)
+
+
+def test_the_step_response_of_an_integrator_keeps_its_feedthrough():
+    np.testing.assert_array_equal(
+        StateSpace([[1.0]], [[2.0]], [[1.0]], [[5.0]], 1.0).step_response(4).ravel(), [5.0, 7.0, 9.0, 11.0]
+    )
+
+
+def test_the_step_response_starts_at_once_and_needs_a_sampled_model():
+    model = random_model(0)
+    np.testing.assert_array_equal(model.step_response(1)[0], model.D)
+    with pytest.raises(MampcError, match="n: expected a whole number of at least 1"):
+        model.step_response(0)
+    with pytest.raises(MampcError, match="discretise it first"):
+        StateSpace([[-1.0]], [[1.0]], [[1.0]], None, 0.0).step_response(3)
 
 
 def test_the_response_of_a_continuous_model_is_refused():

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mampc.base.checks import Array, ComplexArray, as_array, as_matrix, as_number, as_vector
+from mampc.base.checks import Array, ComplexArray, as_array, as_matrix, as_number, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.base.files import read_text, written_whole
 from mampc.base.names import Names, require_count
@@ -131,6 +131,32 @@ class StateSpace:
             )
         gain: Array = self.C @ np.linalg.solve(singular, self.B) + self.D
         return gain
+
+    def step_response(self, n: int) -> Array:
+        """Outputs after a unit step of each input at sample 0, in deviations: S_0 .. S_{n-1}.
+
+            S_i = D + sum_{k < i} C A^k B
+
+        Args:
+            n: at least 1, samples.
+
+        Returns:
+            Shape (n, l, m + d), in output units per unit of input; the columns of measured disturbances stand
+            behind those of the inputs. Infinite or not-a-number where an unstable model leaves the numbers.
+
+        Raises:
+            MampcError: a continuous model, or n below 1.
+        """
+        if not self.is_discrete:
+            raise MampcError("step_response: expected a discrete model, received dt = 0; discretise it first")
+        increments = np.empty((as_whole("n", n, 1), *self.D.shape))
+        increments[0], state = self.D, self.B
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(1, n):
+                increments[k] = self.C @ state
+                state = self.A @ state
+            response: Array = np.cumsum(increments, axis=0)
+        return response
 
     def zeros(self) -> ComplexArray:
         """Transmission zeros of a square model: generalised eigenvalues of its system matrix.
