@@ -7,7 +7,7 @@ import mampc
 from builders import cost_of, predicted, random_model, random_weight, sample_data, tank_model, tank_problem
 from mampc.program.condensing import CondensedQP
 from mampc.program.daqp import DaqpSolver
-from mampc.program.qp import QPStatus
+from mampc.program.qp import QPStatus, QuadraticProgram
 
 SEEDS = range(12)
 
@@ -35,39 +35,39 @@ def random_case(seed, **settings):
     }
 
 
-def planned_inputs(problem, sample, d):
-    return sample["u_previous"] + np.cumsum(d.reshape(problem.control_horizon, -1), axis=0)
+def planned_inputs(problem, given, d):
+    return given["u_previous"] + np.cumsum(d.reshape(problem.control_horizon, -1), axis=0)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_predictions_equal_a_simulation_of_the_model(seed):
-    problem, sample = random_case(seed, output_weight=1.0)
+    problem, given = random_case(seed, output_weight=1.0)
     condensed = CondensedQP(problem)
     d = np.random.default_rng(seed).standard_normal(condensed.n_moves)
     y = predicted(
-        problem.model, sample["x"], planned_inputs(problem, sample, d), problem.prediction_horizon + 1,
-        sample["input_disturbance"], sample["output_disturbance"],
+        problem.model, given["x"], planned_inputs(problem, given, d), problem.prediction_horizon + 1,
+        given["input_disturbance"], given["output_disturbance"],
     )  # fmt: skip
-    reference = np.broadcast_to(sample["reference"], y.shape)
-    error = sample_data(condensed, **sample).error - condensed.theta @ d
+    reference = np.broadcast_to(given["reference"], y.shape)
+    error = sample_data(condensed, **given).error - condensed.theta @ d
     np.testing.assert_allclose(error, (reference - y).ravel(), atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("limits", [mampc.Limits(), mampc.Limits(y_min=-0.5, y_max=0.3)], ids=["none", "y"])
 def test_the_cost_of_any_moves_equals_the_cost_of_their_plan(seed, limits):
-    problem, sample = random_case(seed, limits=limits, output_limit_weight=7.0)
+    problem, given = random_case(seed, limits=limits, output_limit_weight=7.0)
     condensed = CondensedQP(problem)
     d = np.random.default_rng(seed).standard_normal(condensed.n_moves)
-    expected = cost_of(problem, plan=planned_inputs(problem, sample, d), **sample)
-    assert condensed.cost(sample_data(condensed, **sample), d) == pytest.approx(expected, rel=1e-11)
+    expected = cost_of(problem, plan=planned_inputs(problem, given, d), **given)
+    assert condensed.cost(sample_data(condensed, **given), d) == pytest.approx(expected, rel=1e-11)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_quadratic_form_is_the_cost_less_its_constant_part(seed):
-    problem, sample = random_case(seed)
+    problem, given = random_case(seed)
     condensed = CondensedQP(problem)
-    sample = sample_data(condensed, **sample)
+    sample = sample_data(condensed, **given)
     d = np.random.default_rng(seed).standard_normal(condensed.n_moves)
     quadratic = d @ condensed.H @ d / 2 + sample.f_moves @ d
     resting = condensed.cost(sample, np.zeros_like(d))
@@ -76,26 +76,26 @@ def test_the_quadratic_form_is_the_cost_less_its_constant_part(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_optimum_without_limits_is_at_hand_in_the_instance(seed):
-    problem, sample = random_case(seed)
+    problem, given = random_case(seed)
     condensed = CondensedQP(problem)
-    sample = sample_data(condensed, **sample)
+    sample = sample_data(condensed, **given)
     d = sample.moves
     np.testing.assert_allclose(condensed.H @ d + sample.f_moves, 0.0, atol=1e-9 * np.abs(condensed.H).max())
-    np.testing.assert_allclose(sample.inputs, planned_inputs(problem, sample, d).ravel())
+    np.testing.assert_allclose(sample.inputs, planned_inputs(problem, given, d).ravel())
     assert sample.cost == pytest.approx(condensed.cost(sample, d), rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_margins_are_the_distances_of_that_optimum_to_each_bound(seed):
     limits = mampc.Limits(u_min=-1.0, u_max=2.0, du_max=0.5, y_min=-1.0, y_max=1.5)
-    problem, sample = random_case(seed, limits=limits)
+    problem, given = random_case(seed, limits=limits)
     condensed = CondensedQP(problem)
-    sample = sample_data(condensed, **sample)
+    sample = sample_data(condensed, **given)
     d = sample.moves
-    u = planned_inputs(problem, sample, d)
+    u = planned_inputs(problem, given, d)
     y = predicted(
-        problem.model, sample["x"], u, problem.prediction_horizon + 1,
-        sample["input_disturbance"], sample["output_disturbance"],
+        problem.model, given["x"], u, problem.prediction_horizon + 1,
+        given["input_disturbance"], given["output_disturbance"],
     )[1:]  # fmt: skip
     distances = [u + 1, 2 - u, 0.5 - d, d + 0.5, y + 1, 1.5 - y]
     nearest = min(distance.min() for distance in distances)
@@ -103,13 +103,13 @@ def test_margins_are_the_distances_of_that_optimum_to_each_bound(seed):
 
 
 def test_a_constant_reference_equals_its_preview():
-    problem, sample = random_case(3)
+    problem, given = random_case(3)
     condensed = CondensedQP(problem)
     reference = np.arange(1.0, problem.model.n_outputs + 1)
     previewed = np.tile(reference, (problem.prediction_horizon + 1, 1))
-    constant = sample_data(condensed, **sample | {"reference": reference}).data
+    constant = sample_data(condensed, **given | {"reference": reference}).data
     np.testing.assert_allclose(
-        sample_data(condensed, **sample | {"reference": previewed}).data, constant, atol=1e-12
+        sample_data(condensed, **given | {"reference": previewed}).data, constant, atol=1e-12
     )
 
 
@@ -124,10 +124,10 @@ def test_a_constant_reference_equals_its_preview():
     ids=["u", "all", "du y"],
 )
 def test_a_restricted_program_equals_the_full_one_with_zeros_forced(seed, limits):
-    problem, sample = random_case(seed, limits=limits, output_limit_weight=20.0)
+    problem, given = random_case(seed, limits=limits, output_limit_weight=20.0)
     condensed = CondensedQP(problem)
-    sample["u_previous"] = np.clip(sample["u_previous"], -1.0, 1.0)
-    sample, v = sample_data(condensed, **sample), condensed.n_violations
+    given["u_previous"] = np.clip(given["u_previous"], -1.0, 1.0)
+    sample, v = sample_data(condensed, **given), condensed.n_violations
     pattern = np.random.default_rng(seed).random(condensed.n_moves) < 0.5
     pattern[0] = True
     restriction = condensed.restricted(pattern)
@@ -136,7 +136,7 @@ def test_a_restricted_program_equals_the_full_one_with_zeros_forced(seed, limits
         sample.lower[restriction.bounds],
         sample.upper[restriction.bounds],
     )
-    forced = mampc.qp.QuadraticProgram(  # the full program, each idle move fixed by a row of its own
+    forced = QuadraticProgram(  # the full program, each idle move fixed by a row of its own
         condensed.program.H,
         np.vstack([condensed.program.A, np.eye(v + condensed.n_moves)[v:][~pattern]]),
         condensed.program.n_simple,
