@@ -242,8 +242,8 @@ def test_the_window_holds_one_past_change_less_than_the_sparsity_horizon():
     inputs = np.array([[1.0], [2.0], [4.0], [4.0], [8.0]])
     rules = mampc.MoveRules(max_moves=4, sparsity_horizon=3)
     np.testing.assert_array_equal(rules.past_changes(inputs), [[0.0], [4.0]])
-    assert AdmissiblePatterns(rules, n_inputs=1, control_horizon=10).past(inputs).left == 3
-    assert AdmissiblePatterns(rules, n_inputs=1, control_horizon=2).past(inputs).left == 2
+    assert AdmissiblePatterns(rules, n_inputs=1, control_horizon=10).allowance(inputs).left == 3
+    assert AdmissiblePatterns(rules, n_inputs=1, control_horizon=2).allowance(inputs).left == 2
 
 
 def test_the_next_sample_starts_from_the_shifted_pattern():
@@ -328,7 +328,7 @@ def test_without_any_limit_the_polished_plan_is_the_best_on_its_pattern():
 def test_rounding_of_what_was_applied_is_no_move():
     rules = mampc.MoveRules(max_moves=1, sparsity_horizon=3)
     wobbly = np.array([[50.0, 50.0], [50.0 + 1e-12, 50.0], [50.0, 50.0 - 1e-12]])
-    assert AdmissiblePatterns(rules, n_inputs=2, control_horizon=5).past(wobbly).left == 1
+    assert AdmissiblePatterns(rules, n_inputs=2, control_horizon=5).allowance(wobbly).left == 1
 
 
 def test_output_limits_are_softened_in_every_round():

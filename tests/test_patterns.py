@@ -51,7 +51,7 @@ def as_set(patterns):
 def fitted(seed):
     rules, n_c, m, past = random_rules(seed)
     admissible = AdmissiblePatterns(rules, m, n_c)
-    return admissible, admissible.past(past)
+    return admissible, admissible.allowance(past)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -158,24 +158,24 @@ def test_single_exchanges_lead_to_all_admissible_neighbours_at_their_price(seed)
 def test_past_moves_beyond_the_budget_leave_no_future_move(counting):
     rules = mampc.MoveRules(max_moves=2, sparsity_horizon=4, counting=counting)
     admissible = AdmissiblePatterns(rules, 2, 3)
-    past = admissible.past(np.cumsum(np.ones((4, 2)), axis=0))  # three changes of both inputs
-    assert past.exceeded
-    assert past.left == 0
-    assert not admissible.select(np.ones(6), past).any()
-    assert not admissible.allows(np.eye(6, dtype=bool)[0], past)
-    assert admissible.allows(np.zeros(6, dtype=bool), past)
+    allowance = admissible.allowance(np.cumsum(np.ones((4, 2)), axis=0))  # three changes of both inputs
+    assert allowance.exceeded
+    assert allowance.left == 0
+    assert not admissible.select(np.ones(6), allowance).any()
+    assert not admissible.allows(np.eye(6, dtype=bool)[0], allowance)
+    assert admissible.allows(np.zeros(6, dtype=bool), allowance)
 
 
 def test_the_window_looks_back_on_one_change_fewer_than_its_length():
     admissible = AdmissiblePatterns(mampc.MoveRules(max_moves=2, sparsity_horizon=3), 1, 3)
     at = {change: np.where(np.arange(4) >= change, 1.0, 0.0)[:, None] for change in (1, 2, 3)}
-    assert [admissible.past(at[change]).left for change in (1, 2, 3)] == [2, 1, 1]
+    assert [admissible.allowance(at[change]).left for change in (1, 2, 3)] == [2, 1, 1]
 
 
 def test_a_change_that_is_rounding_is_no_move():
     admissible = AdmissiblePatterns(mampc.MoveRules(max_moves=1, sparsity_horizon=3, dwell=3), 1, 2)
-    assert admissible.past(np.array([[1.0], [1.0 + 5e-10], [1.0]])) == (1, (0,), False)
-    assert admissible.past(np.array([[1.0], [1.0 + 5e-9], [1.0 + 5e-9]])) == (0, (1,), False)
+    assert admissible.allowance(np.array([[1.0], [1.0 + 5e-10], [1.0]])) == (1, (0,), False)
+    assert admissible.allowance(np.array([[1.0], [1.0 + 5e-9], [1.0 + 5e-9]])) == (0, (1,), False)
 
 
 @pytest.mark.parametrize(("age", "rest"), [(1, 3), (2, 2), (3, 1), (4, 0)])
@@ -183,9 +183,9 @@ def test_an_input_rests_for_what_is_left_of_its_dwell_time(age, rest):
     admissible = AdmissiblePatterns(mampc.MoveRules(dwell=4), 2, 6)
     inputs = np.zeros((6, 2))
     inputs[-age:, 0] = 1.0
-    past = admissible.past(inputs)
-    assert past.rest == (rest, 0)
-    first_open = admissible.open(past).reshape(6, 2).argmax(axis=0)
+    allowance = admissible.allowance(inputs)
+    assert allowance.frozen == (rest, 0)
+    first_open = admissible.open(allowance).reshape(6, 2).argmax(axis=0)
     assert first_open.tolist() == [rest, 0]
 
 
@@ -202,6 +202,6 @@ def test_the_random_rules_bind_often():
     with_past = [moved(random_rules(seed)[3]).any() for seed in SEEDS]
     past = [fitted(seed)[1] for seed in SEEDS]
     assert sum(with_past) > 50
-    assert sum(any(p.rest) for p in past) > 20
+    assert sum(any(p.frozen) for p in past) > 20
     assert sum(p.exceeded for p in past) > 8
     assert sum(0 < len(admissible_patterns(seed)) - 1 < 60 for seed in SEEDS) > 50

@@ -125,7 +125,7 @@ class Controller(ABC):
         depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
         reference = as_shaped("reference", reference, constant if depth == 1 else previewed)
         present = None if limits is None else LimitsNow(limits, self.condensed)
-        by_hand = self.by_hand(manual)
+        by_hand = self.manual_inputs(manual)
         if by_hand is not None:
             present = self._released(state, present, by_hand)
         rest = None if by_hand is None else np.where(by_hand, self.problem.control_horizon, 0)
@@ -181,7 +181,7 @@ class Controller(ABC):
             low, high = present.planned_min[0], present.planned_max[0]
         return bool(((u < low - SAME) | (u > high + SAME)).any())
 
-    def by_hand(self, manual: Any) -> BoolArray | None:
+    def manual_inputs(self, manual: Any) -> BoolArray | None:
         """Which inputs are in manual, shape (m,), as `step` is told; None for no input.
 
         Raises:
@@ -297,8 +297,8 @@ class Controller(ABC):
 
     def _unrestricted(self, sample: Sample, state: ControllerState) -> Plan:
         """Plain MPC: every move is free. Where no limit is active the optimum is at hand already."""
-        if sample.rest is not None:
-            return self._while_resting(sample, sample.rest)
+        if sample.frozen is not None:
+            return self._while_resting(sample, sample.frozen)
         margins = sample.margins
         if margins[margins.argmin()] > INSIDE:
             return Plan(sample.moves, Status.OPTIMAL, 0, None, None, sample.inputs, sample.cost)

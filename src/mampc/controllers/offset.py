@@ -34,7 +34,7 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     nothing = np.full(l, np.inf)
     all_at_once = np.zeros(admissible.n_moves, dtype=bool)
     all_at_once[:m] = True
-    rested = admissible.past(np.zeros((rules.memory, m)))
+    rested = admissible.allowance(np.zeros((rules.memory, m)))
     promised = admissible.allows(all_at_once, rested) and not admissible.sized and rules.blocks is None
     stable = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0) < 1 - 1e-9
     if not promised or not stable or m < l:

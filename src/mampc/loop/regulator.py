@@ -153,7 +153,7 @@ class Regulator:
         memory, actuators, v_last = state.controller, state.actuators, state.measured_disturbance
         if u_applied is not None:
             told = as_shaped("u_applied", u_applied, self._u_shape)
-            by_hand = self.controller.by_hand(manual)
+            by_hand = self.controller.manual_inputs(manual)
             inputs, actuators = self._actuators.applied(actuators, memory.inputs, told, by_hand)
             if inputs is not memory.inputs:
                 memory = replace(memory, inputs=inputs)

@@ -64,7 +64,7 @@ class ADMMSearch(HeuristicSearch):
         )
 
     def _propose(
-        self, sample: Sample, past: Allowance, guess: Array | None, best: Incumbent
+        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
     ) -> tuple[int, Array | None]:
         first_step, mu = self._first_step, self._first_step.mu
         data, unlimited = first_step.begin(sample), sample.moves
@@ -79,7 +79,7 @@ class ADMMSearch(HeuristicSearch):
                 if solved is not QPStatus.OPTIMAL:
                     best.failure = solved
                     return rounds, moves
-                pattern = self.admissible.select(mu * (d + w) ** 2, past)
+                pattern = self.admissible.select(mu * (d + w) ** 2, allowance)
                 v = (d + w) * pattern
                 w = w + d - v
             if pattern.tobytes() not in proposed:

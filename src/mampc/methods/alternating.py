@@ -6,7 +6,7 @@ at most s entries, mu the penalty that ties them:
     first step     d <- argmin J(d) + mu |v_future - d|^2     within the limits
     second step    v <- the s entries of psi largest in magnitude, zero elsewhere
 
-until |u_{i+1} - u_i|_1 <= eps1. Allowance entries are fixed and compete in the second step. At a fixed point
+until |u_{i+1} - u_i|_1 <= eps1. Past entries are fixed and compete in the second step. At a fixed point
 v = d on the pattern and v = 0 off it, so d is the MPC solution with move weight lambda on the pattern and
 lambda + mu off it: moves off the pattern shrink and never vanish. `polish` makes them vanish.
 
@@ -83,9 +83,9 @@ class AlternatingSearch(HeuristicSearch):
 
     def plan(self, sample: Sample, inputs: Array, guess: Array | None) -> Plan:
         """Algorithm 1 for one sample, from the guess that the last sample left (at first: v = 0)."""
-        past = self.admissible.past(inputs, sample.rest)
+        allowance = self.admissible.allowance(inputs, sample.frozen)
         v = np.zeros(self.condensed.n_moves) if guess is None else guess.ravel()
-        choose = self._second_step(inputs, past)
+        choose = self._second_step(inputs, allowance)
         settled = alternate(
             self._first_step, sample, v, choose, self.settings.tolerance, self.settings.max_iterations
         )
@@ -96,24 +96,24 @@ class AlternatingSearch(HeuristicSearch):
         else:
             status = Status.FEASIBLE if self._polish else Status.SETTLED
         shifted = self._shifted(settled.v)
-        if not self._polish and sample.rest is None:  # at rest, not even a small move
-            return Plan(settled.d, status, settled.rounds, guess=shifted, remarks=self._remarks(past))
+        if not self._polish and sample.frozen is None:  # a frozen input makes not even a small move
+            return Plan(settled.d, status, settled.rounds, guess=shifted, remarks=self._remarks(allowance))
         pattern = settled.v != 0.0
-        if not self.admissible.allows(pattern, past):  # past moves compete above; here they are gone for good
+        if not self.admissible.allows(pattern, allowance):  # past moves compete above, and are done
             pattern = self.admissible.select(
-                np.where(pattern, np.abs(settled.d) + self.admissible.price.max(), 0.0), past
+                np.where(pattern, np.abs(settled.d) + self.admissible.price.max(), 0.0), allowance
             )
         best = Incumbent()
         self._solver.offer(sample, pattern, best)
         return self._certified(
-            self._best(sample, best, past, settled.rounds, shifted, status), sample, inputs
+            self._best(sample, best, allowance, settled.rounds, shifted, status), sample, inputs
         )
 
-    def _second_step(self, inputs: Array, past: Allowance) -> Callable[[Array], BoolArray]:
+    def _second_step(self, inputs: Array, allowance: Allowance) -> Callable[[Array], BoolArray]:
         """What picks the pattern: the paper's threshold for a budget, its extension for other rules."""
         threshold, mu = self._threshold, self.settings.penalty
         if threshold is None:
-            return lambda d: self.admissible.select(mu * d * d, past)
+            return lambda d: self.admissible.select(mu * d * d, allowance)
         magnitude = threshold.magnitude(self.rules.past_changes(inputs))
         return lambda d: threshold.pattern(magnitude, d)
 

@@ -30,7 +30,7 @@ class GreedySearch(HeuristicSearch):
         self._local = LocalSearch(condensed, self.admissible)
 
     def _propose(
-        self, sample: Sample, past: Allowance, guess: Array | None, best: Incumbent
+        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
     ) -> tuple[int, Array | None]:
-        self._local.offer(self._solver, sample, self._priced_limits(sample), past, best)
+        self._local.offer(self._solver, sample, self._priced_limits(sample), allowance, best)
         return best.solved, None

@@ -51,7 +51,7 @@ class HardThresholdingSearch(HeuristicSearch):
         self._contraction = np.eye(condensed.n_moves) - condensed.H / self._lipschitz
 
     def _propose(
-        self, sample: Sample, past: Allowance, guess: Array | None, best: Incumbent
+        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
     ) -> tuple[int, Array | None]:
         L, step = self._lipschitz, -self._priced_limits(sample) / self._lipschitz
         d: Array = sample.moves if guess is None else guess
@@ -59,7 +59,7 @@ class HardThresholdingSearch(HeuristicSearch):
         while rounds < self.settings.max_iterations:
             rounds += 1
             free = self._contraction @ d + step
-            pattern = self.admissible.select(0.5 * L * free * free, past)
+            pattern = self.admissible.select(0.5 * L * free * free, allowance)
             last, d = d, free * pattern
             if np.abs(d - last).max() <= self.settings.tolerance:
                 break

@@ -59,15 +59,17 @@ class HeuristicSearch:
 
     def plan(self, sample: Sample, inputs: Array, guess: Array | None) -> Plan:
         """The best plan on any proposed pattern."""
-        past, best = self.admissible.past(inputs, sample.rest), Incumbent()
+        allowance, best = self.admissible.allowance(inputs, sample.frozen), Incumbent()
         rounds, found = 0, None
-        if past.left:
+        if allowance.left:
             last = None if guess is None else guess.ravel()
-            rounds, found = self._propose(sample, past, last, best)
-        return self._certified(self._best(sample, best, past, rounds, self._shifted(found)), sample, inputs)
+            rounds, found = self._propose(sample, allowance, last, best)
+        return self._certified(
+            self._best(sample, best, allowance, rounds, self._shifted(found)), sample, inputs
+        )
 
     def _propose(
-        self, sample: Sample, past: Allowance, guess: Array | None, best: Incumbent
+        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
     ) -> tuple[int, Array | None]:
         """Offer plans to `best`; returns the rounds this took and moves, (n_moves,), to start the next sample from."""
         return 0, None
@@ -76,21 +78,21 @@ class HeuristicSearch:
         self,
         sample: Sample,
         best: Incumbent,
-        past: Allowance,
+        allowance: Allowance,
         rounds: int,
         guess: Array | None,
         status: Status = Status.FEASIBLE,
     ) -> Plan:
         """The best plan offered, as an answer; no moves at all is always among them."""
         best.offer(self._solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
-        remarks = self._remarks(past)
+        remarks = self._remarks(allowance)
         if best.moves is None:
             held = Status.HELD_INFEASIBLE if best.failure is None else HELD_BY[best.failure]
             return Plan(None, held, rounds, guess=guess, remarks=remarks)
         return Plan(best.moves, status, rounds, guess=guess, objective=best.objective, remarks=remarks)
 
-    def _remarks(self, past: Allowance) -> tuple[Remark, ...]:
-        return (Remark.BUDGET_EXCEEDED,) if past.exceeded else ()
+    def _remarks(self, allowance: Allowance) -> tuple[Remark, ...]:
+        return (Remark.BUDGET_EXCEEDED,) if allowance.exceeded else ()
 
     def _priced_limits(self, sample: Sample) -> Array:
         """The linear term of the moves, with the limits priced by the multipliers of plain MPC."""

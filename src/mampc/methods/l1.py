@@ -73,14 +73,14 @@ class L1Search(HeuristicSearch):
         self._program = DaqpSolver(QuadraticProgram(H, A, full.n_simple), tolerance=1e-9 * np.sqrt(CURVATURE))
 
     def _propose(
-        self, sample: Sample, past: Allowance, guess: Array | None, best: Incumbent
+        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
     ) -> tuple[int, Array | None]:
         proposed: dict[bytes, BoolArray] = {}
         largest, rounds = np.abs(sample.moves).max(), 0
         c = np.ones(self.condensed.n_moves)
         self._program.start()
         for _ in range(self.settings.reweightings + 1):
-            d, programs = self._weighed(sample, past, c, ZERO * largest, proposed)
+            d, programs = self._weighed(sample, allowance, c, ZERO * largest, proposed)
             rounds += programs
             c = 1 / (np.abs(d) + 0.1 * largest + 1e-300)
             c /= c.max()
@@ -89,7 +89,7 @@ class L1Search(HeuristicSearch):
         return rounds, None
 
     def _weighed(
-        self, sample: Sample, past: Allowance, c: Array, zero: float, proposed: dict[bytes, BoolArray]
+        self, sample: Sample, allowance: Allowance, c: Array, zero: float, proposed: dict[bytes, BoolArray]
     ) -> tuple[Array, int]:
         """Moves under the least weight that meets the rules (or the last of a path), and programs solved."""
         n = self.condensed.n_moves
@@ -109,10 +109,10 @@ class L1Search(HeuristicSearch):
                 break
             d = solution.z[-2 * n : -n]
             size = np.where(np.abs(d) > zero, np.abs(d), 0.0)
-            admissible = self.admissible.allows(size > 0, past)
+            admissible = self.admissible.allows(size > 0, allowance)
             # Above any price: here size alone decides, and prices when the patterns are polished.
             pattern = self.admissible.select(
-                np.where(size > 0, size + self.admissible.price.max(), 0.0), past
+                np.where(size > 0, size + self.admissible.price.max(), 0.0), allowance
             )
             proposed[pattern.tobytes()] = pattern
             if admissible:

@@ -64,7 +64,7 @@ class PenaltyDecompositionSearch(HeuristicSearch):
         self._largest_mu = 0.25 * LARGEST_CONDITION * float(np.linalg.eigvalsh(condensed.program.H)[0])
 
     def _propose(
-        self, sample: Sample, past: Allowance, guess: Array | None, best: Incumbent
+        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
     ) -> tuple[int, Array | None]:
         settings, rounds = self.settings, 0
         v: Array = np.zeros(self.condensed.n_moves) if guess is None else guess
@@ -76,7 +76,7 @@ class PenaltyDecompositionSearch(HeuristicSearch):
             first_step = self._first_steps[number]
             mu = first_step.mu
             inner = alternate(
-                first_step, sample, v, lambda d, mu=mu: self.admissible.select(mu * d * d, past),  # type: ignore[misc]
+                first_step, sample, v, lambda d, mu=mu: self.admissible.select(mu * d * d, allowance),  # type: ignore[misc]
                 settings.tolerance, settings.max_iterations,
             )  # fmt: skip
             rounds += inner.rounds

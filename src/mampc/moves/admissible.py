@@ -18,11 +18,17 @@ from mampc.moves.rules import MoveRules
 
 
 class Allowance(NamedTuple):
-    """What the moves already made leave: moves of the budget, and samples each input must still rest."""
+    """What the moves already made allow.
+
+    Attributes:
+        left: moves of the budget that are left.
+        frozen: for how many samples from now on each input may not move, m of them.
+        exceeded: whether the window holds more moves than the budget already.
+    """
 
     left: int
-    rest: tuple[int, ...]
-    exceeded: bool  # the window holds more moves than the budget already
+    frozen: tuple[int, ...]
+    exceeded: bool
 
 
 class AdmissiblePatterns:
@@ -58,7 +64,7 @@ class AdmissiblePatterns:
         self.candidates: BoolArray = np.repeat(starts, m)
         self.simple = rules.dwell == 1 and self.per_step == m and not self.simultaneous
         self._most = n_c if self.simultaneous else self.n_moves
-        self._at_rest = (0,) * m
+        self._all_free = (0,) * m
 
     @property
     def unrestricted(self) -> bool:
@@ -66,13 +72,13 @@ class AdmissiblePatterns:
         free = self.rules.max_moves is None and self.rules.dwell == 1 and self.per_step == self.n_inputs
         return free and bool(self.candidates.all()) and not self.priced and not self.sized
 
-    def past(self, inputs: Array, resting: Any = None) -> Allowance:
-        """What the applied inputs, shape (h, m) with the latest last, leave.
+    def allowance(self, inputs: Array, frozen: Any = None) -> Allowance:
+        """What the applied inputs, shape (h, m) with the latest last, allow.
 
-        `resting`: samples that each input has to rest for besides, shape (m,), or None.
+        `frozen`: for how many samples each input may not move in any case, shape (m,), or None.
         """
         rules = self.rules
-        left, exceeded, rest = self._most, False, self._at_rest
+        left, exceeded, until = self._most, False, self._all_free
         if rules.max_moves is not None:
             left = rules.max_moves
             if rules.sparsity_horizon > 1:
@@ -82,17 +88,17 @@ class AdmissiblePatterns:
         if rules.dwell > 1:
             moved = _moved(inputs[-rules.dwell :])[::-1]  # moved[t]: t + 1 samples before the next decision
             since = np.where(moved.any(axis=0), moved.argmax(axis=0) + 1, rules.dwell)
-            rest = tuple((rules.dwell - since).tolist())
-        if resting is not None:
-            rest = tuple(np.maximum(resting, rest).tolist())
-        return Allowance(left, rest, exceeded)
+            until = tuple((rules.dwell - since).tolist())
+        if frozen is not None:
+            until = tuple(np.maximum(frozen, until).tolist())
+        return Allowance(left, until, exceeded)
 
-    def open(self, past: Allowance) -> BoolArray:
-        """The moves that neither blocks nor rest forbid, shape (n_moves,)."""
-        if not any(past.rest):
+    def open(self, allowance: Allowance) -> BoolArray:
+        """The moves of inputs that are not frozen, at the starts of blocks, shape (n_moves,)."""
+        if not any(allowance.frozen):
             return self.candidates
         j = np.arange(self.n_moves) // self.n_inputs
-        return self.candidates & (j >= np.tile(past.rest, self.control_horizon))
+        return self.candidates & (j >= np.tile(allowance.frozen, self.control_horizon))
 
     def count(self, pattern: BoolArray) -> int:
         """How many moves a pattern, shape (n_moves,), holds, as budget and price count them."""
@@ -110,22 +116,22 @@ class AdmissiblePatterns:
             return float(self.price[0] * moved.any(axis=1).sum())
         return float(moved.sum(axis=0) @ self.price)
 
-    def allows(self, pattern: BoolArray, past: Allowance) -> bool:
+    def allows(self, pattern: BoolArray, allowance: Allowance) -> bool:
         """Whether a pattern, shape (n_moves,), is admissible."""
-        builder = PatternBuilder(self, past)
+        builder = PatternBuilder(self, allowance)
         return all(builder.add(int(i)) for i in np.flatnonzero(pattern))
 
-    def select(self, worth: Array, past: Allowance) -> BoolArray:
+    def select(self, worth: Array, allowance: Allowance) -> BoolArray:
         """A pattern of large total worth less price, shape (n_moves,): best moves first, as rules allow.
 
         The best pattern under budgets, prices and limits per sample; a greedy choice where dwell times bind.
         """
-        m, builder = self.n_inputs, PatternBuilder(self, past)
-        worth = np.where(self.open(past), worth, 0.0)
+        m, builder = self.n_inputs, PatternBuilder(self, allowance)
+        worth = np.where(self.open(allowance), worth, 0.0)
         if self.simple:
             rank = worth - np.tile(self.price, self.control_horizon)
             pattern = np.zeros(self.n_moves, dtype=bool)
-            pattern[np.argsort(-rank, kind="stable")[: past.left]] = True
+            pattern[np.argsort(-rank, kind="stable")[: allowance.left]] = True
             return pattern & (rank > 0)
         if self.simultaneous:
             by_sample = worth.reshape(-1, m)
@@ -147,14 +153,16 @@ class AdmissiblePatterns:
         return builder.pattern
 
     def listed(self, most: int) -> BoolArray | None:
-        """All patterns admissible from rest, shape (K, n_moves); None if there are more than `most`."""
+        """All patterns admissible in steady state, shape (K, n_moves); None if there are more than `most`."""
         found: list[list[int]] = []
-        past = Allowance(
+        allowance = Allowance(
             self._most if self.rules.max_moves is None else min(self.rules.max_moves, self._most),
-            self._at_rest,
+            self._all_free,
             False,
         )
-        for chosen in self._grown([], np.flatnonzero(self.candidates).tolist(), PatternBuilder(self, past)):
+        for chosen in self._grown(
+            [], np.flatnonzero(self.candidates).tolist(), PatternBuilder(self, allowance)
+        ):
             found.append(chosen)
             if len(found) > most:
                 return None
@@ -174,8 +182,8 @@ class AdmissiblePatterns:
 class PatternBuilder:
     """A pattern to which moves are added one by one, as long as the rules allow."""
 
-    def __init__(self, admissible: AdmissiblePatterns, past: Allowance) -> None:
-        self._of, self._past = admissible, past
+    def __init__(self, admissible: AdmissiblePatterns, allowance: Allowance) -> None:
+        self._of, self._allowance = admissible, allowance
         self.pattern: BoolArray = np.zeros(admissible.n_moves, dtype=bool)
         self._at = [0] * admissible.control_horizon  # moves at each sample
         self._when: list[list[int]] = [[] for _ in range(admissible.n_inputs)]  # samples at which each moves
@@ -184,20 +192,20 @@ class PatternBuilder:
     @property
     def full(self) -> bool:
         """Whether the budget is spent (with simultaneous counting, samples that move may still hold more)."""
-        return self._used >= self._past.left and not self._of.simultaneous
+        return self._used >= self._allowance.left and not self._of.simultaneous
 
     def add(self, i: int) -> bool:
         """Add move i if that is admissible; says whether it was."""
-        of, past = self._of, self._past
+        of, allowance = self._of, self._allowance
         j, a = divmod(i, of.n_inputs)
         counts = not of.simultaneous or self._at[j] == 0
         dwell = of.rules.dwell
         if (
             self.pattern[i]
-            or (counts and self._used >= past.left)
+            or (counts and self._used >= allowance.left)
             or self._at[j] >= of.per_step
             or not of.candidates[i]
-            or j < past.rest[a]
+            or j < allowance.frozen[a]
             or (dwell > 1 and any(abs(j - other) < dwell for other in self._when[a]))
         ):
             return False

@@ -17,11 +17,11 @@ class PatternNeighbours:
     """
 
     def __init__(
-        self, admissible: AdmissiblePatterns, past: Allowance, pattern: BoolArray | None = None
+        self, admissible: AdmissiblePatterns, allowance: Allowance, pattern: BoolArray | None = None
     ) -> None:
-        self._of, self._past = admissible, past
+        self._of, self._allowance = admissible, allowance
         n, m, dwell = admissible.n_moves, admissible.n_inputs, admissible.rules.dwell
-        self._open = admissible.open(past)
+        self._open = admissible.open(allowance)
         self._sample = np.arange(n) // m
         self._price: Array = np.tile(admissible.price, admissible.control_horizon)
         self._near = None  # pairs of moves that the dwell time keeps apart
@@ -48,7 +48,7 @@ class PatternNeighbours:
 
     def additions(self) -> BoolArray:
         """Moves that may be added, shape (n_moves,)."""
-        room = self._used < self._past.left
+        room = self._used < self._allowance.left
         allowed = self._open & ~self.pattern
         if self._of.simple:
             return allowed if room else np.zeros_like(allowed)
@@ -71,7 +71,7 @@ class PatternNeighbours:
             allowed &= near.sum(axis=0) - near == 0
         if self._of.simultaneous:
             used = self._used - (self._at[self.held] == 1)
-            allowed &= (at > 0) | (used < self._past.left)[:, None]
+            allowed &= (at > 0) | (used < self._allowance.left)[:, None]
         return allowed
 
     def _at_without(self) -> Array:

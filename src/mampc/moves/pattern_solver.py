@@ -123,8 +123,8 @@ class PatternSolver:
         """
         base = sample.constant + self.admissible.charge(pattern)
         every_lower, every_upper = sample.lower, sample.upper
-        if sample.present is not None:
-            own = sample.present.on(pattern)
+        if sample.bounds_now is not None:
+            own = sample.bounds_now.on(pattern)
             if own is None:
                 return OnPattern(None, np.inf, QPStatus.INFEASIBLE, None, 0)
             every_lower, every_upper = own

@@ -20,7 +20,7 @@ def without_rounding(condensed: CondensedQP, sample: Sample, moves: Array) -> Ar
     inputs = u + moves.reshape(-1, len(u)).cumsum(axis=0)
     inputs = np.concatenate((u[None], np.minimum(np.maximum(inputs, limits.u_min), limits.u_max)))
     changes: Array = inputs[1:] - inputs[:-1]
-    if sample.rest is not None:  # in manual, wherever that is
+    if sample.frozen is not None:  # in manual, wherever that is
         changes[:, ~moves.reshape(changes.shape).any(axis=0)] = 0.0
     changes[np.abs(changes) <= SAME] = 0.0
     return changes.ravel()

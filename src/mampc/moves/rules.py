@@ -1,8 +1,4 @@
-"""Move rules: which patterns of future moves are admissible, given the moves already made.
-
-A pattern says for every future move du_j of every input whether it may differ from zero. Patterns are
-boolean arrays of shape (nc m,), time-major like the moves themselves.
-"""
+"""Move rules: what moves cost, and which patterns of them the user allows; `admissible` applies them."""
 
 from __future__ import annotations
 

@@ -259,10 +259,10 @@ class CondensedQP:
             v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
         return np.concatenate((x, u_previous, d_u, d_y, v, one, reference))
 
-    def sample(self, parameter: Array, u_previous: Array, rest: Indices | None = None) -> Sample:
-        """The data of one sample, from its `parameter`; `rest` as in `Sample`."""
+    def sample(self, parameter: Array, u_previous: Array, frozen: Indices | None = None) -> Sample:
+        """The data of one sample, from its `parameter`; `frozen` as in `Sample`."""
         maps = self._constant_map if len(parameter) == self._constant_map.shape[1] else self._preview_map
-        return Sample(maps.dot(parameter), self.parts, parameter, u_previous, rest)
+        return Sample(maps.dot(parameter), self.parts, parameter, u_previous, frozen)
 
     def cost(self, sample: Sample, moves: Array) -> float:
         """Tracking cost plus move weights plus output-limit penalty of the moves d, shape (n_moves,)."""

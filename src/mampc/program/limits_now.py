@@ -86,7 +86,7 @@ class LimitsNow:
             np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), condensed.bounded_rows,
             self.planned_min - u, self.planned_max - u, bound_of_move,
         )  # fmt: skip
-        return Sample(sample.data, sample.parts, sample.parameter, sample.u_previous, sample.rest, present)
+        return Sample(sample.data, sample.parts, sample.parameter, sample.u_previous, sample.frozen, present)
 
 
 def _rows(name: str, value: Any, usual: Array, rows: int) -> Array:

@@ -66,11 +66,11 @@ class Sample(Optimum):
     Attributes:
         parameter: p.
         u_previous: shape (m,).
-        rest: samples that each input may not move for, whatever the rules say, shape (m,); None for none.
-        present: the bounds, where they are those of this sample alone; else None.
+        frozen: for how many samples each input may not move, whatever the rules say, shape (m,); None for none.
+        bounds_now: the bounds, where they are those of this sample alone; else None.
     """
 
-    __slots__ = ("_constant", "parameter", "present", "rest", "u_previous")
+    __slots__ = ("_constant", "bounds_now", "frozen", "parameter", "u_previous")
 
     def __init__(
         self,
@@ -78,16 +78,16 @@ class Sample(Optimum):
         parts: Parts,
         parameter: Array,
         u_previous: Array,
-        rest: Indices | None = None,
-        present: BoundsNow | None = None,
+        frozen: Indices | None = None,
+        bounds_now: BoundsNow | None = None,
     ) -> None:
         self.data, self.parts, self.parameter, self.u_previous = data, parts, parameter, u_previous
-        self.rest, self.present = rest, present
+        self.frozen, self.bounds_now = frozen, bounds_now
         self._margins: Array | None = None
         self._constant: float | None = None
-        if present is not None:
-            data[parts.lower], data[parts.upper] = present.lower, present.upper
-            self._margins = present.margins(data[parts.moves])
+        if bounds_now is not None:
+            data[parts.lower], data[parts.upper] = bounds_now.lower, bounds_now.upper
+            self._margins = bounds_now.margins(data[parts.moves])
 
     @property
     def f(self) -> Array:
@@ -171,6 +171,8 @@ class PatternOptimum:
         """Its values for one sample; margins belong to the bounds that `CondensedQP.restricted` keeps, or
         to all of them where they are this sample's own.
         """
-        parameter, present = sample.parameter, sample.present
+        parameter, bounds_now = sample.parameter, sample.bounds_now
         data = self._maps[len(parameter)].dot(parameter)
-        return Optimum(data, self.parts, None if present is None else present.margins(data[self.parts.moves]))
+        return Optimum(
+            data, self.parts, None if bounds_now is None else bounds_now.margins(data[self.parts.moves])
+        )

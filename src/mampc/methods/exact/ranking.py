@@ -62,7 +62,7 @@ class Ranking:
         """Where the patterns stand among which the best one is, given the past."""
         rows = self._rows_within[min(past.left, len(self._rows_within) - 1)]
         return (
-            slice(0, rows.stop) if any(past.rest) else rows
+            slice(0, rows.stop) if any(past.frozen) else rows
         )  # inputs at rest may leave part of the budget unspent
 
     def bounds(self, f: Array, past: Allowance) -> Array:
@@ -76,7 +76,7 @@ class Ranking:
             values += self.charge[rows]
         if self.admissible.sized:
             values += self._lift(f, rows.stop)
-        if any(past.rest):
+        if any(past.frozen):
             values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
         return values
 

@@ -76,7 +76,7 @@ class ExactSearch:
 
     def plan(self, sample: Sample, inputs: Array, guess: Array | None = None) -> Plan:
         """The best moves of all admissible patterns for one sample."""
-        past = self.admissible.past(inputs, sample.rest)
+        past = self.admissible.allowance(inputs, sample.frozen)
         if past.exceeded:
             return self._search(sample, past)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
         return self._search(sample, past)
@@ -160,7 +160,7 @@ class ExactSearch:
             if best.failure is not None:
                 return Plan(None, HELD_BY[best.failure], best.solved)
             hold = np.zeros(self.condensed.n_moves)
-            if sample.present is not None and sample.present.on(hold != 0) is None:
+            if sample.bounds_now is not None and sample.bounds_now.on(hold != 0) is None:
                 return Plan(None, Status.HELD_INFEASIBLE, best.solved)
             return Plan(hold, status, best.solved, bound)
         lower = None if status is Status.OPTIMAL else min(bound, best.objective)

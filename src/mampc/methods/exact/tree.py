@@ -125,7 +125,7 @@ class PatternTree:
         terms, *others = map(self._terms, priced)
         for other in others:
             terms.add(other)
-        rest = np.array(past.rest, dtype=np.intp)
+        rest = np.array(past.frozen, dtype=np.intp)
         root = Nodes(
             np.full((1, 0), -1), np.zeros(1, np.intp), np.zeros(1), (rest - of.rules.dwell)[None],
             np.zeros(1, np.intp), np.array([terms.tail[0].max() + self._least_price]),
