@@ -245,6 +245,10 @@ def identify(
     console.print(_fit_table(record.names.outputs, identified.fit, validation))
     values = " ".join(f"{value:.3g}" for value in identified.singular_values[:8])
     console.print(f"Order {identified.order}; first singular values {values}", soft_wrap=True)
+    if identified.integrators:
+        console.print(
+            f"{identified.integrators} of its poles integrate: they are exactly one", soft_wrap=True
+        )
     if identified.stabilised:
         _complain(
             "warning: poles outside the unit circle were mirrored to its inside; check the record for drifts"

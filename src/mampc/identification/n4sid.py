@@ -1,30 +1,34 @@
-"""Subspace identification (N4SID) of a state-space model from one input-output record.
-
-Block Hankel matrices with s block rows split the record into past (p) and future (f). Projecting the
-future outputs off the future inputs leaves, up to noise, the observability matrix times states that the
-past inputs and outputs determine; a singular value decomposition finds its range and the order.
-
-Sources: Van Overschee and De Moor, Subspace Identification for Linear Systems (1996), whose unifying
-theorem gives the weightings; Verhaegen, Automatica 30 (1994) for the projected form used here.
-"""
+"""Subspace identification (N4SID) of a state-space model from input-output records."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from mampc.base.checks import Array, as_whole
 from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
-from mampc.identification.realisation import realise
-from mampc.identification.triangular import fold
+from mampc.identification.integrators import explains_as_well, near_one, with_integrators
+from mampc.identification.realisation import inside_unit_circle, realise
+from mampc.identification.scaling import Scaled, scaled
+from mampc.identification.simulation_error import InputFit, fit_inputs, independent_samples, residuals
+from mampc.identification.subspace import (
+    WEIGHTINGS,
+    correlations,
+    hankel_factor,
+    observability,
+    require_excitation,
+    supported_order,
+)
 from mampc.identification.validation import Validation, validate
 from mampc.systems.state_space import StateSpace
 
-WEIGHTINGS = ("cva", "n4sid", "moesp")
 NEAR_BEST = 1.02  # simulation errors that are as good as equal
-_CHUNK = 4096  # Hankel columns taken into the triangular factor at once
+SIGNIFICANT = 4.0  # a square of two standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +36,13 @@ class Identified:
     """An identified model and how well it explains the record it came from.
 
     Attributes:
-        model: discrete `StateSpace` whose operating point is the mean of the record.
-        x0: state at the first sample, shape (n,).
-        singular_values: of the weighted projection, shape (s * l,); canonical correlations for "cva".
+        model: discrete `StateSpace`; its operating point is where the model rests at the mean inputs.
+        x0: state at the first sample of the first record, shape (n,).
+        singular_values: of the weighted projection, shape (s * l,); canonical correlations for "cva",
+            else in the outputs' units.
         order: n.
-        fit: percent per output, shape (l,), of the simulated model on the record itself.
+        integrators: how many poles are exactly one.
+        fit: percent per output, shape (l,), of the simulated model on the (first) record itself.
         stabilised: True if poles were moved inside the unit circle.
     """
 
@@ -44,6 +50,7 @@ class Identified:
     x0: Array
     singular_values: Array
     order: int
+    integrators: int
     fit: Array
     stabilised: bool
 
@@ -53,7 +60,7 @@ class Identified:
 
 
 def n4sid(
-    data: IOData,
+    data: IOData | Sequence[IOData],
     *,
     order: int | None = None,
     weighting: str = "cva",
@@ -61,10 +68,13 @@ def n4sid(
     feedthrough: bool = True,
     unstable: str = "stabilise",
 ) -> Identified:
-    """Identify a state-space model; the means of the record become its operating point.
+    """Identify a state-space model from one record or several of the same plant.
+
+    Every signal counts in units of its own spread. Slow poles that the record cannot tell from one are made
+    exactly one (see `integrators`), and the operating point is one at which the model rests.
 
     Args:
-        data: the record.
+        data: a record, or several of the same plant, each with an initial state and constants of its own.
         order: n; by default the singular values say how many orders the record supports, and the
             smallest of these is taken whose simulation error is within 2 % of the best.
         weighting: "cva" (canonical variates: whitens the future outputs, best with noise), "n4sid" or
@@ -81,131 +91,150 @@ def n4sid(
         raise MampcError(f"weighting: expected one of {WEIGHTINGS}, received {weighting!r}")
     if unstable not in ("stabilise", "refuse"):
         raise MampcError(f"unstable: expected 'stabilise' or 'refuse', received {unstable!r}")
-    m, l = data.u.shape[1], data.y.shape[1]
-    s = _block_rows(len(data), m, l, order, block_rows)
-    signals = zip(
-        (*data.names.inputs, *data.names.disturbances, *data.names.outputs),
-        (*data.u.T, *data.y.T),
-        strict=True,
-    )
-    still = [name for name, signal in signals if np.ptp(signal) == 0]
-    if still:
-        raise MampcError(f"n4sid: expected signals that vary, received constant {', '.join(still)}")
-    u_op, y_op = data.u.mean(axis=0), data.y.mean(axis=0)
-    u, y = data.u - u_op, data.y - y_op
-
-    R = _triangular_factor(u, y, s)
-    _require_excitation(R, m, s)
-    gamma, singular_values = _observability(R, m, l, s, weighting)
+    given = _records(data)
+    first = given[0]
+    m, l = first.u.shape[1], first.y.shape[1]
+    s = _block_rows([len(record) for record in given], m, l, order, block_rows)
+    records = scaled(given)
+    degree = 0
+    # A record that starts or ends in a transient has means that are not a rest of the system: the constant
+    # left would pass for one more mode. "n4sid" and "moesp" keep it, as SLICOT does.
+    R = hankel_factor(records.u, records.y, s, degree if weighting == "cva" else -1)
+    require_excitation(R, m, s)
+    gamma, singular_values = observability(R, m, l, s, weighting, records.y_spread)
     if order is None:
-        _, correlations = _canonical(*_projection(R[1:, 1:], m, l, s))
-        orders = range(1, supported_order(correlations, len(data) - 2 * s - s * m, m, l, s) + 1)
+        most = supported_order(
+            correlations(R, m, l, s), records.samples - 2 * s * len(given) - s * m, m, l, s
+        )
+        orders = range(1, most + 1)
     elif order <= len(singular_values) - l:
         orders = range(order, order + 1)
     else:
         most = len(singular_values) - l
         raise MampcError(f"order: expected at most {most} with {s} block rows, received {order}")
-    candidates = [realise(gamma[:, :n], u, y, feedthrough=feedthrough, unstable=unstable) for n in orders]
-    best = min(candidate.error for candidate in candidates)
-    chosen = next(candidate for candidate in candidates if candidate.error <= NEAR_BEST * best)
-    manipulated = len(data.names.inputs)
-    model = StateSpace(
-        chosen.A, chosen.B, chosen.C, chosen.D, data.dt, u_op[:manipulated], y_op, data.names,
-        v_op=u_op[manipulated:],
-    )  # fmt: skip
-    quality = validate(model, data)
+    chosen = _best_order(gamma, orders, records, feedthrough, unstable)
+    chosen = _with_integrators(chosen, gamma[:, : len(chosen.A)], records, feedthrough, unstable)
+    chosen = _without_idle_constant(chosen, records, feedthrough)
+    model = _model(chosen, records, first)
+    quality = validate(model, first)
     return Identified(
-        model, quality.x0, singular_values, model.n_states, quality.fit, chosen.stabilised
+        model, quality.x0, singular_values, model.n_states, chosen.integrators, quality.fit, chosen.stabilised
+    )
+
+
+class _Candidate(NamedTuple):
+    A: Array
+    C: Array
+    integrators: int
+    stabilised: bool
+    fit: InputFit
+
+
+def _best_order(
+    gamma: Array, orders: Sequence[int], records: Scaled, feedthrough: bool, unstable: str
+) -> _Candidate:
+    """The smallest order whose simulation error is nearly the least."""
+    candidates = []
+    for n in orders:
+        A, C = realise(gamma[:, :n], records.y[0].shape[1])
+        A, stabilised = inside_unit_circle(A, unstable)
+        candidates.append(_Candidate(A, C, 0, stabilised, fit_inputs(A, C, records, feedthrough=feedthrough)))
+    best = min(candidate.fit.error for candidate in candidates)
+    return next(candidate for candidate in candidates if candidate.fit.error <= NEAR_BEST * best)
+
+
+def _with_integrators(
+    found: _Candidate, gamma: Array, records: Scaled, feedthrough: bool, unstable: str
+) -> _Candidate:
+    """As many slow poles moved to one as the records do not contradict; see `integrators`."""
+    A, C = realise(gamma, records.y[0].shape[1])
+    counts = near_one(A, max(map(len, records.u)))
+    if not counts:
+        return found
+    free = found
+    if found.stabilised:  # what grows slowly is compared as it was found
+        free = found._replace(fit=fit_inputs(A, C, records, feedthrough=feedthrough))
+    for q in counts:
+        A1, C1 = with_integrators(A, C, q)
+        A1, stabilised = inside_unit_circle(A1, unstable, q)
+        fit = fit_inputs(A1, C1, records, feedthrough=feedthrough, integrators=q)
+        if explains_as_well(fit.error, free.fit.error, independent_samples(residuals(A1, C1, fit, records))):
+            return _Candidate(A1, C1, q, stabilised, fit)
+    return found
+
+
+def _without_idle_constant(found: _Candidate, records: Scaled, feedthrough: bool) -> _Candidate:
+    """Constants beside the means only where they say something: elsewhere they compete with slow modes."""
+    if found.integrators:
+        return found
+    A, C = found.A, found.C
+    fit = fit_inputs(A, C, records, feedthrough=feedthrough, degree=-1)
+    left = independent_samples(residuals(A, C, found.fit, records))
+    constants = len(records.u) * len(C)
+    if left * (fit.error**2 - found.fit.error**2) <= SIGNIFICANT * constants * found.fit.error**2:
+        return found._replace(fit=fit)
+    return found
+
+
+def _model(chosen: _Candidate, records: Scaled, like: IOData) -> StateSpace:
+    """In engineering units, about the rest that the records' constants tell.
+
+    Where integrators drift under the mean inputs, the inputs of the operating point are the nearest ones, in
+    units of their spread, under which they rest.
+    """
+    A, C, q, (B, D, trends, _) = chosen.A, chosen.C, chosen.integrators, chosen.fit
+    m = len(like.names.inputs)
+    share = np.array([len(u) for u in records.u]) / records.samples
+    drive = sum(w * trend.drive for w, trend in zip(share, trends, strict=True))
+    du = np.linalg.lstsq(B[:q, :m], -drive)[0] if q else np.zeros(m)
+    rest = np.linalg.solve(np.eye(len(A) - q) - A[q:, q:], B[q:, :m] @ du)
+    constant = sum(
+        w * (mean + records.y_spread * trend.polynomial[:1].sum(axis=0))
+        for w, mean, trend in zip(share, records.y_mean, trends, strict=True)
+    )
+    y_op = constant + records.y_spread * (C[:, q:] @ rest + D[:, :m] @ du)
+    u_op = records.u_mean.copy()
+    u_op[:m] += du * records.u_spread[:m]
+    rows = records.y_spread[:, None]
+    return StateSpace(
+        A, B / records.u_spread, rows * C, rows * D / records.u_spread, like.dt, u_op[:m], y_op,
+        like.names, v_op=u_op[m:],
     )  # fmt: skip
 
 
-def supported_order(correlations: Array, columns: int, m: int, l: int, s: int) -> int:
-    """How many canonical correlations are larger than chance makes them, 1 to 20.
-
-    Chance reaches up to the edge of Wachter's distribution (Annals of Statistics 8, 1980).
-
-    Args:
-        correlations: singular values of the weighting "cva", shape (s * l,).
-        columns: Hankel columns less those that the future inputs take up.
-        m, l, s: numbers of inputs, outputs and block rows.
-    """
-    past, future = min(1.0, s * (m + l) / columns), min(1.0, s * l / columns)
-    edge = np.sqrt(past * (1 - future)) + np.sqrt(future * (1 - past))
-    counted = int(np.count_nonzero(correlations > edge if past + future < 1 else correlations > 1.0))
-    return max(1, min(counted, len(correlations) - l, 20))
+def _records(data: IOData | Sequence[IOData]) -> list[IOData]:
+    records = [data] if isinstance(data, IOData) else list(data)
+    if not records or not all(isinstance(record, IOData) for record in records):
+        raise MampcError("n4sid: expected a record (IOData) or several, received something else")
+    first = records[0]
+    for record in records[1:]:
+        if not np.isclose(record.dt, first.dt, rtol=1e-6) or record.names != first.names:
+            raise MampcError(
+                "n4sid: expected records of one sample time and one set of names, "
+                f"received {first.dt:g} s and {record.dt:g} s, {first.names} and {record.names}"
+            )
+    return records
 
 
-def _block_rows(samples: int, m: int, l: int, order: int | None, block_rows: int | None) -> int:
+def _block_rows(samples: list[int], m: int, l: int, order: int | None, block_rows: int | None) -> int:
     if order is not None:
         as_whole("order", order, 1)
     least = 2 if order is None else -(-order // l) + 1
-    # 2 s (m + l) Hankel rows want at least as many columns, N - 2 s + 1.
-    most = (samples + 1) // (2 * (m + l + 1))
+
+    # 2 s (m + l) Hankel rows want at least as many columns, N - 2 s + 1 of each record.
+    def fits(s: int) -> bool:
+        return 2 * s * (m + l) <= sum(max(0, N - 2 * s + 1) for N in samples)
+
+    most = bisect_left(range(1, max(samples) + 1), True, key=lambda s: not fits(s))
+    total = sum(samples)
     if most < least:
         raise MampcError(
             f"n4sid: expected at least {2 * (m + l + 1) * least - 1} samples for {m} inputs, {l} outputs"
-            f"{'' if order is None else f' and order {order}'}, received {samples}"
+            f"{'' if order is None else f' and order {order}'}, received {total}"
         )
     if block_rows is None:
-        return max(least, min(max(15, least + 5), samples // (8 * (m + l)), most))
+        return max(least, min(max(15, least + 5), total // (8 * (m + l)), most))
     s = as_whole("block_rows", block_rows, least)
     if s > most:
-        raise MampcError(f"block_rows: expected at most {most} for {samples} samples, received {s}")
+        raise MampcError(f"block_rows: expected at most {most} for {total} samples, received {s}")
     return s
-
-
-def _observability(R: Array, m: int, l: int, s: int, weighting: str) -> tuple[Array, Array]:
-    """Range of the observability matrix, shape (s l, s l), and the weighted singular values.
-
-    A record that starts or ends in a transient has means that are not a rest of the system: what is left
-    is a constant, which would pass for one more mode. "cva" projects it off; "n4sid" and "moesp" keep it,
-    as SLICOT does.
-    """
-    if weighting == "cva":
-        return _canonical(*_projection(R[1:, 1:], m, l, s))
-    projected, _ = _projection(fold(R[:1, 1:], R[1:, 1:]), m, l, s)
-    left, singular_values, _ = np.linalg.svd(projected)
-    return left, singular_values
-
-
-def _projection(R: Array, m: int, l: int, s: int) -> tuple[Array, Array]:
-    """The future outputs off the future inputs: their part along the past, and the rest; factors only."""
-    future, past = s * m, s * (m + l)
-    return R[future : future + past, future + past :].T, R[future + past :, future + past :].T
-
-
-def _canonical(projected: Array, remainder: Array) -> tuple[Array, Array]:
-    """The range after whitening the future outputs, and the canonical correlations with the past."""
-    values, vectors = np.linalg.eigh(projected @ projected.T + remainder @ remainder.T)
-    floor = np.sqrt(np.maximum(values, values[-1] * 1e-14))  # noise-free records have flat directions
-    left, correlations, _ = np.linalg.svd((vectors / floor).T @ projected)
-    return (vectors * floor) @ left, correlations
-
-
-def _require_excitation(R: Array, m: int, s: int) -> None:
-    """The inputs must be linearly independent over 2 s samples, and not constant."""
-    size = np.abs(np.diag(R)[1 : 1 + 2 * s * m])
-    if not size.min() > 1e-10 * max(size.max(), 1e-300):
-        raise MampcError(
-            f"n4sid: expected inputs that excite {2 * s} samples' span, received too poor or constant ones; "
-            "use a longer or richer record, or fewer block_rows"
-        )
-
-
-def _triangular_factor(u: Array, y: Array, s: int) -> Array:
-    """R of the QR factorisation of the Hankel rows (1, U_f, U_p, Y_p, Y_f), transposed, in chunks.
-
-    Memory is that of one chunk, whatever the length of the record.
-    """
-    columns = len(u) - 2 * s + 1
-    windows_u = np.lib.stride_tricks.sliding_window_view(u, 2 * s, axis=0)  # (columns, m, 2 s)
-    windows_y = np.lib.stride_tricks.sliding_window_view(y, 2 * s, axis=0)
-    R: Array = np.empty((0, 1 + 2 * s * (u.shape[1] + y.shape[1])))
-    for start in range(0, columns, _CHUNK):
-        chunk = slice(start, start + _CHUNK)
-        U = windows_u[chunk].transpose(0, 2, 1)
-        Y = windows_y[chunk].transpose(0, 2, 1)
-        parts = (U[:, s:], U[:, :s], Y[:, :s], Y[:, s:])
-        hankel = [np.ones((len(U), 1)), *(part.reshape(len(U), -1) for part in parts)]
-        R = fold(R, np.concatenate(hankel, axis=1))
-    return R

@@ -9,6 +9,7 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
+from mampc.identification.simulation_error import filtered
 from mampc.identification.triangular import fold, solve
 from mampc.systems.state_space import StateSpace
 
@@ -64,18 +65,24 @@ def fit(y: Array, y_hat: Array) -> Array:
 
 
 def initial_state(model: StateSpace, data: IOData) -> Array:
-    """The state at the first sample that fits the outputs best, shape (n,); least squares."""
+    """The state at the first sample that fits the outputs best, shape (n,).
+
+    Least squares over all samples, each output in units of its standard deviation.
+    """
     unexplained = data.y - model.response(data.u)
-    normal: Array = np.empty((0, model.n_states + 1))
-    rows, block = model.C, 2048
-    for start in range(0, len(data), block):
-        free = np.empty((len(unexplained[start : start + block]), *model.C.shape))
-        for k in range(len(free)):
-            free[k] = rows
-            rows = rows @ model.A
-        stacked = np.concatenate([free, unexplained[start : start + block, :, None]], axis=2)
-        normal = fold(normal, stacked.reshape(-1, model.n_states + 1))
-    return solve(normal)
+    spread = data.y.std(axis=0)
+    spread[spread == 0.0] = 1.0
+    impulse = np.zeros((len(data), 1))
+    impulse[0] = 1.0
+    factor: Array = np.empty((0, model.n_states + 1))
+    start = 0
+    for free in filtered(model.A, model.C / spread[:, None], impulse):
+        rows = np.concatenate(
+            [free[..., 0], (unexplained[start : start + len(free)] / spread)[..., None]], axis=2
+        )
+        factor = fold(factor, rows.reshape(-1, model.n_states + 1))
+        start += len(free)
+    return solve(factor)
 
 
 def whiteness(residuals: Array, lags: int = 20) -> Array:

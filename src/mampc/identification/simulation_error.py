@@ -1,0 +1,195 @@
+"""B and D by least squares on the simulation error, given A and C.
+
+Initial states and trends are fitted with them, each record its own: B, D and these enter the simulated
+outputs linearly. The outputs of (A, e_i, C) are first-order filters in a row once A is triangular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.identification.scaling import Scaled
+from mampc.identification.triangular import fold, solve
+
+_ENTRIES = 2**22  # numbers taken into the triangular factor at once, 32 MB
+
+
+class Trend(NamedTuple):
+    """What a record needs besides its inputs: x0 (n,), output polynomial (degree + 1, l), drive (q,).
+
+    The polynomial is one of time from -1/2 to 1/2 over the record; the drive is a constant that integrators
+    add up.
+    """
+
+    x0: Array
+    polynomial: Array
+    drive: Array
+
+
+class InputFit(NamedTuple):
+    """B (n, m), D (l, m), the trend of each record, and the root of the sum of squared errors."""
+
+    B: Array
+    D: Array
+    trends: list[Trend]
+    error: float
+
+
+def fit_inputs(
+    A: Array, C: Array, records: Scaled, *, feedthrough: bool, degree: int = 0, integrators: int = 0,
+) -> InputFit:  # fmt: skip
+    """Fit everything but A and C.
+
+    Args:
+        A, C: shapes (n, n) and (l, n), in the units of `records`.
+        records: the scaled records.
+        feedthrough: False fixes D = 0.
+        degree: of the polynomial in time at each output; -1 for none.
+        integrators: how many states, the first ones of A, integrate and nothing else. A constant at
+            the outputs that their initial states make is not fitted twice; a constant at their inputs is.
+    """
+    n, m, l, q = len(A), records.u[0].shape[1], len(C), integrators
+    directions = _complement(C[:, :q]) if degree >= 0 else np.zeros((l, 0))  # outputs' constants
+    drives = q if degree >= 0 else 0
+    own = n + directions.shape[1] * (degree + 1) + drives
+    common = n * m + (l * m if feedthrough else 0)
+    factor: Array = np.empty((0, common + 1))
+    heads = []
+    for u, y in zip(records.u, records.y, strict=True):
+        R: Array = np.empty((0, own + common + 1))
+        for rows in _rows(A, C, u, y, feedthrough, degree, directions, drives):
+            R = fold(R, rows)
+        heads.append(R[:own])
+        factor = fold(factor, R[own:, own:])
+    theta = solve(factor)
+    error = float(np.linalg.norm(factor[:, -1] - factor[:, :-1] @ theta))
+    trends = []
+    for head, samples in zip(heads, map(len, records.u), strict=True):
+        left = head[:, -1] - head[:, own:-1] @ theta
+        specific = solve(np.column_stack([head[:, :own], left]))
+        polynomial = specific[n : own - drives].reshape(degree + 1, directions.shape[1]) @ directions.T
+        trends.append(Trend(specific[:n], polynomial, specific[own - drives :] / samples))
+    B = theta[: n * m].reshape(n, m)
+    D = theta[n * m :].reshape(l, m) if feedthrough else np.zeros((l, m))
+    return InputFit(B, D, trends, error)
+
+
+def _rows(
+    A: Array, C: Array, u: Array, y: Array, feedthrough: bool, degree: int, directions: Array, drives: int
+) -> Iterator[Array]:
+    """Blocks of equations: x0, polynomial, drive, B, D, and the right-hand side; l rows per sample."""
+    (l, n), (N, m) = C.shape, u.shape
+    signals = np.zeros((N, m + 1 + (drives > 0)))
+    signals[0, 0] = 1.0
+    signals[1:, 1 : 1 + m] = u[:-1]
+    signals[1:, 1 + m :] = 1.0 / N  # of the size of its sum
+    time = np.arange(N) / N - 0.5
+    start = 0
+    for response in filtered(A, C, signals):
+        count = len(response)
+        chunk = slice(start, start + count)
+        powers = time[chunk, None] ** np.arange(degree + 1)
+        parts = [
+            response[..., 0],
+            np.einsum("kd,lc->kldc", powers, directions).reshape(count, l, -1),
+            response[:, :, :drives, -1],
+            response[..., 1 : 1 + m].reshape(count, l, n * m),
+        ]
+        if feedthrough:
+            parts.append(np.einsum("op,kj->kopj", np.eye(l), u[chunk]).reshape(count, l, l * m))
+        parts.append(y[chunk][..., None])
+        yield np.concatenate(parts, axis=2).reshape(count * l, -1)
+        start += count
+
+
+def filtered(A: Array, C: Array, signals: Array) -> Iterator[Array]:
+    """What (A, e_i, C) makes of each signal w: sum over j <= k of C A^(k-j) e_i w(j), in blocks of samples.
+
+    Args:
+        signals: shape (N, p).
+
+    Yields:
+        shape (block, l, n, p).
+    """
+    from scipy.linalg import rsf2csf, schur
+    from scipy.signal import lfilter
+
+    (l, n), (N, p) = C.shape, signals.shape
+    T, U = schur(A, output="real")
+    if np.any(np.diag(T, -1)):
+        T, U = rsf2csf(T, U)
+    c = C @ U
+    block = max(1, min(N, _ENTRIES // (4 * l * n * p)))
+    last = np.zeros((n, l, p, 1), dtype=T.dtype)
+    for start in range(0, N, block):
+        w = signals[start : start + block].T
+        G = np.empty((n, l, p, w.shape[1]), dtype=T.dtype)
+        before = np.empty_like(G)  # G one sample earlier
+        for i in range(n):
+            drive = c[:, i, None, None] * w + np.tensordot(T[:i, i], before[:i], axes=1)
+            G[i], _ = lfilter([1.0], [1.0, -T[i, i]], drive, axis=-1, zi=T[i, i] * last[i])
+            before[i, ..., :1], before[i, ..., 1:] = last[i], G[i, ..., :-1]
+        last = G[..., -1:].copy()
+        yield np.real(np.tensordot(G, U.conj(), axes=(0, 1))).transpose(2, 0, 3, 1)
+
+
+def _complement(C: Array) -> Array:
+    """An orthonormal basis, as columns, of what the columns of C leave; shape (l, l - rank)."""
+    if not C.shape[1]:
+        return np.eye(len(C))
+    left, size, _ = np.linalg.svd(C)
+    return left[:, np.count_nonzero(size > 1e-9 * max(size[0], 1e-300)) :]
+
+
+def residuals(A: Array, C: Array, fit: InputFit, records: Scaled) -> list[Array]:
+    """Measured less simulated outputs of each record, shape (N, l), in the units of `records`."""
+    left: list[Array] = []
+    for u, y, trend in zip(records.u, records.y, fit.trends, strict=True):
+        push = u @ fit.B.T
+        push[:, : len(trend.drive)] += trend.drive
+        time = np.arange(len(u)) / len(u) - 0.5
+        constants = time[:, None] ** np.arange(len(trend.polynomial)) @ trend.polynomial
+        left.append(y - states(A, push, trend.x0) @ C.T - u @ fit.D.T - constants)
+    return left
+
+
+def states(A: Array, push: Array, x0: Array) -> Array:
+    """x[k + 1] = A x[k] + push[k] from x[0] = x0, shape (N, n), without a loop over samples."""
+    from scipy.linalg import rsf2csf, schur
+    from scipy.signal import lfilter
+
+    n = len(A)
+    T, U = schur(A, output="real")
+    if np.any(np.diag(T, -1)):
+        T, U = rsf2csf(T, U)
+    z = np.zeros((n, len(push) + 1), dtype=T.dtype)
+    z[:, 0] = U.conj().T @ x0
+    z[:, 1:] = U.conj().T @ push.T
+    for i in range(n - 1, -1, -1):
+        z[i, 1:] += T[i, i + 1 :] @ z[i + 1 :, :-1]
+        z[i] = lfilter([1.0], [1.0, -T[i, i]], z[i])
+    x: Array = np.real(U @ z[:, :-1]).T
+    return x
+
+
+def independent_samples(residuals: Sequence[Array]) -> float:
+    """How many independent numbers residuals (N, l) amount to, given how they are correlated in time.
+
+    N / (1 + 2 sum of the autocorrelations up to where they first vanish), summed over outputs.
+    """
+    total = 0.0
+    for residual in residuals:
+        N = len(residual)
+        centred = residual - residual.mean(axis=0)
+        spectrum = np.fft.rfft(centred, 2 * N, axis=0)
+        covariance = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[:N]
+        for column in covariance.T:
+            if column[0] <= 0:
+                continue
+            first = int(np.argmax(column <= 0)) or N
+            total += N * column[0] / (column[0] + 2 * column[1:first].sum())
+    return total
