@@ -7,8 +7,12 @@ export UV_COMPILE_BYTECODE := 1
 export UV_PYTHON_DOWNLOADS := never
 export UV_LINK_MODE := copy
 export VIRTUAL_ENV := $(CURDIR)/.venv
+# One thread a process: the tests and benchmarks share the cores among processes, and small matrices gain nothing.
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: demo test fuzz lint format bench methods figures lock clean help
+.PHONY: demo test deep coverage fuzz lint format bench methods figures lock clean help
 .DEFAULT_GOAL := help
 
 help:  ## what can be made
@@ -18,10 +22,16 @@ demo: .venv/run.stamp  ## run the quadruple-tank study: a table, results/quadrup
 	$(BIN)/mampc run quadruple-tank --out results/quadruple-tank
 
 test: .venv/dev.stamp  ## run the tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(PYTEST) $(PYTEST_ARGS)
+
+deep: .venv/dev.stamp  ## run the seeds that `make test` leaves out
+	$(PYTEST) -m slow $(PYTEST_ARGS)
+
+coverage: .venv/dev.stamp  ## run the tests and show which branches none of them takes
+	$(PYTEST) --cov --cov-report=term-missing:skip-covered $(PYTEST_ARGS)
 
 fuzz: .venv/dev.stamp  ## 100 000 fuzzed steps of the regulator
-	$(BIN)/python -m pytest tests/test_fuzz.py --hypothesis-profile long $(PYTEST_ARGS)
+	$(PYTEST) tests/test_fuzz.py --hypothesis-profile long $(PYTEST_ARGS)
 
 lint: .venv/dev.stamp  ## style, types and the layers of imports
 	$(BIN)/ruff check .
@@ -37,7 +47,7 @@ bench: .venv/dev.stamp  ## speed, as ratios measured side by side
 	$(BIN)/python benchmarks/bench.py
 
 methods: .venv/dev.stamp  ## compare all methods on random instances, and renew their table in docs/methods.md
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/methods.py --markdown
+	$(BIN)/python benchmarks/methods.py --markdown
 
 figures: .venv/run.stamp  ## redraw the figures of the documentation
 	$(BIN)/python docs/draw_figures.py

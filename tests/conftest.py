@@ -1,6 +1,13 @@
 """Every optimal solve of every test is checked for its optimality conditions."""
 
+import os
 import sys
+
+# Before NumPy is there: tests run one process a core, and more threads than cores only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -60,9 +67,28 @@ def _every_optimal_solve_is_certified():
         yield
 
 
+FUZZED: Counter[str] = Counter()  # steps of the regulator by status, of all processes
+
+
+def _fuzzed_here():
+    fuzz = sys.modules.get("test_fuzz")
+    return Counter() if fuzz is None else fuzz.STEPPED
+
+
+def pytest_sessionfinish(session):
+    """A process of several tells the first one what it fuzzed."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["fuzzed"] = {str(status): n for status, n in _fuzzed_here().items()}
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    FUZZED.update(getattr(node, "workeroutput", {}).get("fuzzed", {}))
+
+
 def pytest_terminal_summary(terminalreporter):
     """How many steps were fuzzed, and how they ended."""
-    fuzz = sys.modules.get("test_fuzz")
-    if fuzz is not None and fuzz.STEPPED:
-        ends = ", ".join(f"{count} {status}" for status, count in fuzz.STEPPED.most_common())
-        terminalreporter.write_line(f"{fuzz.STEPPED.total()} fuzzed steps of the regulator: {ends}")
+    FUZZED.update(_fuzzed_here())
+    if FUZZED:
+        ends = ", ".join(f"{count} {status}" for status, count in FUZZED.most_common())
+        terminalreporter.write_line(f"{FUZZED.total()} fuzzed steps of the regulator: {ends}")

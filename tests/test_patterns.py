@@ -9,6 +9,7 @@ import mampc
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.exchanges import PatternNeighbours
 from referees import all_patterns, charge, counted, keeps_rules, moved
+from seeds import seeds
 
 SEEDS = range(120)
 
@@ -54,7 +55,7 @@ def fitted(seed):
     return admissible, admissible.allowance(past)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(120, quick=40))
 def test_a_pattern_is_allowed_exactly_if_it_keeps_the_rules_by_their_definition(seed):
     _, n_c, m, _ = random_rules(seed)
     admissible, past = fitted(seed)
@@ -62,7 +63,7 @@ def test_a_pattern_is_allowed_exactly_if_it_keeps_the_rules_by_their_definition(
     assert as_set(allowed) == as_set(admissible_patterns(seed))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(120, quick=40))
 def test_the_list_holds_every_pattern_admissible_from_rest_once(seed):
     admissible, _ = fitted(seed)
     expected = admissible_patterns(seed, from_rest=True)
@@ -72,7 +73,7 @@ def test_the_list_holds_every_pattern_admissible_from_rest_once(seed):
     assert admissible.listed(len(expected) - 1) is None
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(120, quick=40))
 def test_candidates_and_open_moves_are_those_that_some_pattern_may_hold(seed):
     admissible, past = fitted(seed)
     rules, *_ = random_rules(seed)
@@ -85,7 +86,7 @@ def test_candidates_and_open_moves_are_those_that_some_pattern_may_hold(seed):
         np.testing.assert_array_equal(admissible.open(past), admissible_patterns(seed).any(axis=0))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(120, quick=40))
 def test_count_and_charge_are_those_of_the_definitions(seed):
     rules, n_c, m, _ = random_rules(seed)
     admissible, _ = fitted(seed)
@@ -94,7 +95,7 @@ def test_count_and_charge_are_those_of_the_definitions(seed):
         assert admissible.charge(pattern.ravel()) == pytest.approx(charge(rules, pattern), rel=1e-14)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(120, quick=40))
 def test_a_selection_is_admissible_and_best_unless_dwell_times_bind(seed):
     rules, n_c, m, _ = random_rules(seed)
     rng = np.random.default_rng([seed, 1])
@@ -112,7 +113,7 @@ def test_a_selection_is_admissible_and_best_unless_dwell_times_bind(seed):
             assert -1e-12 <= value <= max(values) + 1e-12
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(120, quick=40))
 def test_single_exchanges_lead_to_all_admissible_neighbours_at_their_price(seed):
     rules, n_c, m, _ = random_rules(seed)
     rng = np.random.default_rng([seed, 1])
