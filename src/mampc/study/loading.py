@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from mampc.base.errors import MampcError, StudyError, shown
 from mampc.base.files import read_text
-from mampc.study.schema import Study, Table
+from mampc.study.schema import Place, Study, Table
 
 STUDY_FILE_LIMIT = 2**18  # bytes
 LONGEST_LINE = 2000  # characters; the time that keys of many parts take grows with the square of their length
@@ -62,18 +62,19 @@ def load_study(source: str | Path, *, trust: bool | None = None) -> Study:
         text = read_text(path, STUDY_FILE_LIMIT, "TOML file")
     except MampcError as error:
         raise StudyError(str(error)) from None
-    study = parse_study(text, str(path), trust=trust)
-    study._folder = folder
-    return study
+    return parse_study(text, str(path), trust=trust, folder=folder)
 
 
-def parse_study(text: str, origin: str = "study", *, trust: bool = False) -> Study:
+def parse_study(
+    text: str, origin: str = "study", *, trust: bool = False, folder: Path | None = None
+) -> Study:
     """Check the TOML text of a study.
 
     Args:
-        text: of the study; a model file that it names is looked for in the current folder.
+        text: of the study.
         origin: how messages call it.
         trust: whether a plant named `module:Class` may be imported; text does not tell where it comes from.
+        folder: in which files and modules that it names are looked for; default the current one.
 
     Raises:
         StudyError: names each wrong key, its place, and what was expected there.
@@ -90,12 +91,13 @@ def parse_study(text: str, origin: str = "study", *, trust: bool = False) -> Stu
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise StudyError(f"{origin}: expected TOML, received: {error}") from None
+    if "place" in content:
+        raise StudyError(f"{origin}: study not accepted\n  place: unknown key")
     try:
         study = Study.model_validate(content)
     except ValidationError as error:
         raise StudyError(_complaints(origin, error)) from None
-    study._trusted = trust
-    return study
+    return study.model_copy(update={"place": Place(Path() if folder is None else folder, trust)})
 
 
 def _complaints(origin: str, error: ValidationError) -> str:
@@ -144,7 +146,7 @@ def _known_keys(location: tuple[int | str, ...]) -> list[str]:
     for part in location:
         if isinstance(part, str) and part in table.model_fields:
             table = _table_of(table.model_fields[part].annotation)
-    return sorted(table.model_fields)
+    return sorted(set(table.model_fields) - {"place"})
 
 
 def _table_of(annotation: Any) -> Any:

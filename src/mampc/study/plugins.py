@@ -48,12 +48,12 @@ def make_plant(study: Study) -> Plant:
 def _imported(study: Study) -> Any:
     """The class behind module:Class; its module may lie beside the study."""
     module_name, class_name = study.plant.kind.split(":")
-    if not study._trusted:
+    if not study.place.trusted:
         raise StudyError(
             f"plant.kind: {study.plant.kind!r} runs code, and this study is no file within the current folder; "
             "look at that code, then allow it with --trust (in Python trust=True)"
         )
-    folder = str(study._folder)
+    folder = str(study.place.folder)
     sys.path.insert(0, folder)
     try:
         module = importlib.import_module(module_name)

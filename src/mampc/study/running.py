@@ -111,7 +111,7 @@ def prepare(
         MampcError: values of the study that do not fit its plant or model.
     """
     if model is None and study.model is not None:
-        model = StateSpace.load(_inside(study._folder, study.model.file))
+        model = StateSpace.load(_inside(study.place.folder, study.model.file))
     if model is not None:
         if not np.isclose(model.dt, study.dt, rtol=1e-6):
             raise StudyError(f"dt: expected the model's {model.dt:g} s, received {study.dt:g} s")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import (
     AfterValidator,
@@ -12,7 +12,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    PrivateAttr,
+    InstanceOf,
     model_validator,
 )
 
@@ -210,8 +210,20 @@ class SensorsTable(Table):
     max_blind_steps: Whole = 0
 
 
+class Place(NamedTuple):
+    """Where a study comes from.
+
+    Attributes:
+        folder: in which the files and modules that it names are looked for.
+        trusted: whether its plant's code may be imported.
+    """
+
+    folder: Path = Path()
+    trusted: bool = False
+
+
 class Study(Table):
-    """A checked study; attributes are the keys of the file."""
+    """A checked study; attributes are the keys of the file, and the `place` that it comes from."""
 
     name: Word
     steps: Count
@@ -228,8 +240,7 @@ class Study(Table):
     scenarios: Annotated[list[ScenarioTable], Field(min_length=1)]
     controllers: Annotated[list[ControllerTable], Field(min_length=1)]
 
-    _folder: Path = PrivateAttr(default=Path())
-    _trusted: bool = PrivateAttr(default=False)
+    place: InstanceOf[Place] = Place()
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:
