@@ -140,9 +140,9 @@ def memory_after(told, decided=(0.0, 10.0, 16.0, 21.0), by_hand=None):
     inputs = np.zeros((4, 1))
     state = actuators.initial(inputs)
     for now, u in zip(told, decided, strict=True):
-        inputs, state = actuators.applied(state, inputs, np.array([now]), by_hand)
+        inputs, state = actuators.update(state, inputs, np.array([now]), by_hand)
         believed.append(inputs[:, 0].tolist())
-        state, inputs = state.then(np.array([u])), np.concatenate([inputs[1:], [[u]]])
+        state, inputs = state.decided(np.array([u])), np.concatenate([inputs[1:], [[u]]])
     return believed
 
 
@@ -202,11 +202,11 @@ def test_what_is_believed_is_what_the_rules_say(samples, remembered):
         for k in range(count):
             told = np.array([number if kind == "value" else rules.commands[-1 - late][0] + number])
             manual = np.array([True]) if by_hand else None
-            inputs, state = actuators.applied(state, inputs, told, manual)
+            inputs, state = actuators.update(state, inputs, told, manual)
             rules.told(told, manual)
             np.testing.assert_array_equal(inputs, rules.applied[-remembered:])
             u = np.clip(inputs[-1] + 2.0 * moves[k % len(moves)], -50.0, 50.0)
-            state, inputs = state.then(u), np.concatenate([inputs[1:], u[None]])
+            state, inputs = state.decided(u), np.concatenate([inputs[1:], u[None]])
             rules.decided(u)
 
 

@@ -10,6 +10,7 @@ import pytest
 import mampc
 from builders import identified_tank, same_decision, tank_model, tank_problem, tank_reference
 from mampc import Status
+from mampc.loop.estimation import static_response
 
 TANK = mampc.plants.QuadrupleTank()
 
@@ -374,3 +375,29 @@ def test_more_inputs_than_outputs_leave_no_offset_with_disturbances_at_the_input
     loop = mampc.Regulator(mampc.MPC(problem), mampc.KalmanFilter.offset_free(model, disturbance="input"))
     run = mampc.simulate(model, loop, [1.0, -1.0], steps=300, input_disturbance=[0.3, -0.2, 0.1])
     np.testing.assert_allclose(run.y[-1], [1.0, -1.0], atol=1e-3)
+
+
+def test_the_steady_response_of_an_integrating_model_keeps_its_feedthrough():
+    model = mampc.StateSpace([[1.0]], [[0.01]], [[1.0]], [[5.0]], 1.0)
+    np.testing.assert_allclose(static_response(model), [[5.1]])
+    limits = mampc.Limits(u_min=-1.0, u_max=1.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=5, control_horizon=2, limits=limits)
+    loop = mampc.Regulator(mampc.MPC(problem), mampc.KalmanFilter.offset_free(model, disturbance="input"))
+    # The inputs move the output by 10.2 soon: a tenth of that is a jump.
+    far, near = (loop.step(loop.initial_state(), [y], [0.0]).ignored_outputs for y in (1.1, 0.9))
+    assert far == {"y1": mampc.Fault.JUMP}
+    assert near == {}
+
+
+@pytest.mark.parametrize("size", [2, 120])
+def test_what_is_shown_of_models_filters_regulators_and_runs_fits_a_line_or_two(size):
+    names = mampc.Names(*(tuple(f"{kind}{'x' * 100}{i}" for i in range(size)) for kind in "uyx"))
+    model = mampc.StateSpace(0.5 * np.eye(size), np.eye(size), np.eye(size), None, 1.0, names=names)
+    problem = mampc.TrackingProblem(model, prediction_horizon=2, control_horizon=1)
+    shown = [model, mampc.KalmanFilter.offset_free(model), mampc.Regulator(mampc.MPC(problem))]
+    if size == 2:
+        shown.append(mampc.simulate(model, shown[-1], model.y_op, steps=3))
+        assert "3 optimal" in repr(shown[-1])
+    for thing in shown:
+        assert len(repr(thing)) < 400
+        assert "\n" not in repr(thing)

@@ -279,3 +279,18 @@ def test_an_output_that_washes_out_has_a_largest_jump_too():
         mampc.Regulator(mampc.MPC(problem)), 200, lambda k, y: y, noise=0.3, reference=np.ones(1)
     )
     assert not any(d.ignored_outputs for d in decisions)
+
+
+def test_a_sensor_is_found_stuck_once_and_its_stuck_run_is_no_healthy_one():
+    """Also if nothing comes for a sample meanwhile, and whichever way the model moves the output."""
+    sensors = mampc.SensorChecks(stuck_after=3, largest_jump=1.0).fitted(tank_problem(identified_tank()))
+    none, moving = np.zeros(2), np.array([-0.5, 0.0])
+    state, found = sensors.initial(), []
+    healthy = 30.0 + np.random.default_rng(0).standard_normal(20)
+    for shown in (*healthy, 31.03, 31.03, 31.03, 31.03, np.nan, 31.03, 31.03, 32.0):
+        y = np.array([shown, 20.0 + len(found) / 7])
+        judged, state = sensors.update(state, y, none, moving, none)
+        found.append(bool(judged.newly_stuck[0]))
+    assert np.flatnonzero(found) == [23]
+    np.testing.assert_array_equal(state.longest, 0.0)
+    np.testing.assert_array_equal(state.stuck, 0.0)

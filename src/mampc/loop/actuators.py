@@ -1,12 +1,12 @@
-"""What is told about actuators, judged: did they what was decided, late or not, or something else?
+"""What is reported of actuators, judged: did they what was decided, late or not, or something else?
 
-A told input that does not agree with the decided one is believed at once: the actuator is stuck, saturated or moved
-by hand. Unless told inputs *changed* as decided ones did. Then the actuator obeys, and is
+A reported input that does not agree with the decided one is believed at once: the actuator is stuck, saturated or
+in manual. Unless reported inputs *changed* as decided ones did. Then the actuator obeys, and is
 
-- late, where the told input went from one decided input to the next one, but some samples after these. What it will
-  do next is decided and on its way, so the decided inputs count, as long as this goes on;
-- or read with an offset, where the told input moved as the latest decided one did. Were it believed, an input that
-  is held would go on by the offset at every sample.
+- late, where the reported input went from one decided input to the next one, but some samples after these. What it
+  will do next is decided and on its way, so the decided inputs count, as long as this goes on;
+- or read with an offset, where the reported input moved as the latest decided one did. Were it believed, an input
+  that is held would go on by the offset at every sample.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ import numpy as np
 from mampc.base.checks import LARGEST, Array, BoolArray
 from mampc.program.problem import Limits
 
-NEAR = 0.01  # times the range of an input: neither valves nor their position feedback are more exact
+TOLERANCE = 0.01  # of the range of an input: neither valves nor their position feedback are more exact
+UNKNOWN_RANGE = 1e-6  # input units, where an input has no range
+IN_MANUAL = 0.1  # times the tolerance of an input in manual, so that it goes back to automatic without a bump
 ABSURD = 100.0  # times the range of an input: no actuator is that far outside
-BY_HAND = 0.1  # times that where an input is in manual, so that it goes back to automatic without a bump
 LATEST = 10  # samples that an actuator may be late by
 
 
@@ -30,35 +31,35 @@ class ActuatorState:
 
     Attributes:
         commands: the last `LATEST` + 2 inputs decided, oldest first, each of shape (m,).
-        told: the last inputs told, shape (m,).
+        reported: the last inputs reported, shape (m,).
         late: samples that each actuator is late by, shape (m,).
-        offset: told less decided input where that is explained by the reading, shape (m,).
-        by_hand: 1 where an input was in manual when it was last told of, else 0, shape (m,).
+        offset: reported less decided input where that is explained by the reading, shape (m,).
+        manual: 1 where an input was in manual when it was last reported, else 0, shape (m,).
     """
 
     commands: tuple[Array, ...]
-    told: Array
+    reported: Array
     late: Array
     offset: Array
-    by_hand: Array
+    manual: Array
 
-    def then(self, u: Array) -> ActuatorState:
+    def decided(self, u: Array) -> ActuatorState:
         """What is remembered after the inputs u (m,) were decided."""
         return replace(self, commands=(*self.commands[1:], u))
 
 
 class Actuators:
-    """Judges what is told about the actuators of one problem; its `applied` is pure.
+    """Judges what is reported of the actuators of one problem; `update` is pure.
 
     Args:
         limits: of the inputs.
-        tolerance: within which told and decided inputs agree, shape (m,); None for the default.
+        tolerance: within which reported and decided inputs agree, shape (m,); None for the default.
     """
 
     def __init__(self, limits: Limits, tolerance: Array | None = None) -> None:
         apart = limits.u_max - limits.u_min
         if tolerance is None:
-            tolerance = np.where(np.isfinite(apart), NEAR * apart, 1e-6)
+            tolerance = np.where(np.isfinite(apart), TOLERANCE * apart, UNKNOWN_RANGE)
         self._tolerance = tolerance
         beyond = np.where(apart > 0, ABSURD * apart, LARGEST)
         # Nor is it beyond what controllers decide where there are no limits: half of what counts as a number.
@@ -72,16 +73,16 @@ class Actuators:
         commands = (*(inputs[0],) * (LATEST + 1), *inputs)[-LATEST - 2 :]
         return ActuatorState(commands, inputs[-1], none, none, none)
 
-    def applied(
-        self, state: ActuatorState, inputs: Array, told: Array, by_hand: BoolArray | None
+    def update(
+        self, state: ActuatorState, inputs: Array, reported: Array, manual: BoolArray | None
     ) -> tuple[Array, ActuatorState]:
         """The inputs that count as applied.
 
         Args:
             state: from `initial` or the last decision.
             inputs: applied so far, oldest first, the decided ones last, shape (h, m).
-            told: shape (m,), finite or not; what no actuator reaches is not believed.
-            by_hand: which inputs are in manual, shape (m,), or None for no input.
+            reported: shape (m,), finite or not; what no actuator reaches is not believed.
+            manual: which inputs are in manual, shape (m,), or None for no input.
 
         Returns:
             The inputs (h, m), put right; and the next state, before the next decision.
@@ -91,50 +92,52 @@ class Actuators:
         if late.any():
             answered = np.array(state.commands)[-1 - late.astype(np.intp), self._each]
         expected = answered + offset
-        agrees = np.abs(told - expected) <= tolerance
-        stays = np.abs(told - state.told) <= tolerance
-        careful = None if by_hand is None and not state.by_hand.any() else state.by_hand != 0
+        agrees = np.abs(reported - expected) <= tolerance
+        stays = np.abs(reported - state.reported) <= tolerance
+        careful = None if manual is None and not state.manual.any() else state.manual != 0
         if careful is None and (agrees & stays).all():  # the everyday case, at once
-            return inputs, replace(state, told=told.copy())
-        known = (told > self._low) & (told < self._high)
+            return inputs, replace(state, reported=reported.copy())
+        known = (reported > self._low) & (reported < self._high)
         inputs, late, offset, commands = inputs.copy(), late.copy(), offset.copy(), np.array(state.commands)
         kept = min(len(inputs), len(commands))
         judged = known & ~(agrees & (stays | (late != 0) | (offset != 0)))
-        if careful is not None:  # what is told of manual is no answer to anything decided, also just after it
-            if by_hand is not None:
-                careful = careful | by_hand
-            apart = careful & known & (np.abs(told - state.commands[-1]) > BY_HAND * tolerance)
-            inputs[-1, apart] = told[apart]
+        if careful is not None:  # what is reported in manual is no answer to a decision, also just after it
+            if manual is not None:
+                careful = careful | manual
+            apart = careful & known & (np.abs(reported - state.commands[-1]) > IN_MANUAL * tolerance)
+            inputs[-1, apart] = reported[apart]
             commands[:, careful] = inputs[-1, careful]
             late[careful] = offset[careful] = 0.0
             judged &= ~careful
         for i in np.flatnonzero(judged):
-            answer = _answer(commands[::-1, i], state.told[i], told[i], tolerance[i])
+            answer = _answer(commands[::-1, i], state.reported[i], reported[i], tolerance[i])
             late[i], offset[i] = (0.0, 0.0) if answer is None else answer
             if answer is None:
-                inputs[-1, i] = told[i]
+                inputs[-1, i] = reported[i]
             elif late[i] or offset[i]:  # so what was believed to be something else was decided, too
                 inputs[-kept:, i] = commands[-kept:, i]
-        now = np.zeros_like(told) if by_hand is None else by_hand.astype(np.float64)
-        return inputs, ActuatorState(tuple(commands), np.where(known, told, state.told), late, offset, now)
+        now = np.zeros_like(reported) if manual is None else manual.astype(np.float64)
+        return inputs, ActuatorState(
+            tuple(commands), np.where(known, reported, state.reported), late, offset, now
+        )
 
 
-def _answer(commands: Array, before: float, told: float, tolerance: float) -> tuple[int, float] | None:
+def _answer(commands: Array, before: float, reported: float, tolerance: float) -> tuple[int, float] | None:
     """How late one actuator obeyed, and how far off it is read; None if it did something else.
 
     Args:
         commands: latest first, shape (`LATEST` + 2,).
-        before: what was told last.
-        told: what is told now.
+        before: what was reported last.
+        reported: what is reported now.
         tolerance: within which numbers agree.
     """
-    changed = abs(told - before) > tolerance
+    changed = abs(reported - before) > tolerance
     if changed:
-        went = (np.abs(told - commands[:-1]) <= tolerance) & (np.abs(before - commands[1:]) <= tolerance)
+        went = (np.abs(reported - commands[:-1]) <= tolerance) & (np.abs(before - commands[1:]) <= tolerance)
         if went.any():
             return int(went.argmax()), 0.0
-    if abs(told - commands[0]) <= tolerance:
+    if abs(reported - commands[0]) <= tolerance:
         return 0, 0.0
-    if changed and abs((told - before) - (commands[0] - commands[1])) <= tolerance:
-        return 0, told - commands[0]
+    if changed and abs((reported - before) - (commands[0] - commands[1])) <= tolerance:
+        return 0, reported - commands[0]
     return None

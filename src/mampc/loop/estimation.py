@@ -46,6 +46,10 @@ class KalmanFilter:
         self._gains: dict[bytes, Array] = {}
         self.gain = self.gain_with(np.ones(model.n_outputs, dtype=bool))
 
+    def __repr__(self) -> str:
+        where = "outputs" if self.directions is None else "inputs"
+        return f"KalmanFilter({self.model!r}, {self.model.n_outputs} disturbances at its {where})"
+
     @classmethod
     def offset_free(
         cls,
@@ -222,11 +226,11 @@ def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
 
 
 def static_response(model: StateSpace) -> Array:
-    """Output changes per unit of input, shape (l, m): at rest, or after 10 samples where none comes."""
+    """Output changes per unit of input, shape (l, m): steady, or after 10 samples where the model integrates."""
     try:
         gain = model.dc_gain()
     except MampcError:
-        gain = np.sum([model.C @ np.linalg.matrix_power(model.A, k) @ model.B for k in range(10)], axis=0)
+        gain = model.step_response(11)[-1]
     return gain[:, : model.n_inputs]
 
 

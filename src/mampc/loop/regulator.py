@@ -14,7 +14,7 @@ from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.loop.actuators import LATEST, Actuators
 from mampc.loop.estimation import KalmanFilter
-from mampc.loop.sensors import SensorChecks, newly_stuck
+from mampc.loop.sensors import SensorChecks
 from mampc.loop.state import RegulatorState
 from mampc.program.daqp import active_flags
 from mampc.program.problem import Limits
@@ -69,6 +69,9 @@ class Regulator:
         expected, received = _sizes(model), _sizes(self.estimator.model)
         if received != expected:
             raise MampcError(f"estimator: expected a model with {expected}, received {received}")
+
+    def __repr__(self) -> str:
+        return f"Regulator({type(self.controller).__name__}, {self.estimator!r})"
 
     def initial_state(
         self, u_previous: Any = None, y: Any = None, measured_disturbance: Any = None
@@ -152,9 +155,10 @@ class Regulator:
         y = as_shaped("y", y, self._y_shape)
         memory, actuators, v_last = state.controller, state.actuators, state.measured_disturbance
         if u_applied is not None:
-            told = as_shaped("u_applied", u_applied, self._u_shape)
-            by_hand = self.controller.manual_inputs(manual)
-            inputs, actuators = self._actuators.applied(actuators, memory.inputs, told, by_hand)
+            reported = as_shaped("u_applied", u_applied, self._u_shape)
+            inputs, actuators = self._actuators.update(
+                actuators, memory.inputs, reported, self.controller.manual_inputs(manual)
+            )
             if inputs is not memory.inputs:
                 memory = replace(memory, inputs=inputs)
         u_previous = memory.inputs[-1]
@@ -170,18 +174,17 @@ class Regulator:
         # Measurements show v at once and u later.
         innovation = estimator.innovation(estimate, u_previous, y, v)
         movement = estimator.model.C @ (estimate.x - last.x)
-        believed, ignored, sensors = self._sensors.check(
+        judged, sensors = self._sensors.update(
             state.sensors, y, innovation, movement, last.output_disturbance
         )
-        if not ignored:
+        if not judged.faults:
             estimate = estimator.corrected(estimate, innovation)
         else:
-            stuck = newly_stuck(state.sensors, sensors)
-            if stuck.any():
-                disturbance = np.where(stuck, sensors.disturbance, estimate.output_disturbance)
+            if judged.newly_stuck.any():
+                disturbance = np.where(judged.newly_stuck, sensors.disturbance, estimate.output_disturbance)
                 estimate = replace(estimate, output_disturbance=disturbance)
-            if believed.any():
-                estimate = estimator.corrected(estimate, innovation, believed)
+            if judged.believed.any():
+                estimate = estimator.corrected(estimate, innovation, judged.believed)
         blind = sensors.blind > self.max_blind_steps
         decision = self.controller.step(
             memory,
@@ -195,8 +198,8 @@ class Regulator:
         )
         return replace(
             decision,
-            state=RegulatorState(decision.state, estimate, v, sensors, actuators.then(decision.u)),
-            ignored_outputs=ignored,
+            state=RegulatorState(decision.state, estimate, v, sensors, actuators.decided(decision.u)),
+            ignored_outputs=judged.faults,
             solve_time=perf_counter() - start,
         )
 

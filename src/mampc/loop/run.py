@@ -51,6 +51,13 @@ class Run:
     v: Array
     faults: dict[int, tuple[str, ...]]
 
+    def __repr__(self) -> str:
+        statuses = ", ".join(f"{count} {status}" for status, count in self.statuses.items())
+        return (
+            f"Run({len(self.t)} samples of {self.dt:g} s, {self.u.shape[1]} inputs, {self.y.shape[1]} outputs, "
+            f"decisions: {statuses})"
+        )
+
     def metrics(self, *, threshold: float = 0.1, skip: int = 0) -> Metrics:
         """How often the inputs move and how well the outputs follow; see `Metrics`."""
         return metrics.compute(

@@ -81,6 +81,19 @@ class StateSpace:
                 value.flags.writeable = False
             object.__setattr__(self, name, value)
 
+    def __repr__(self) -> str:
+        names = self.names
+        parts = [
+            f"{self.n_states} states",
+            f"inputs {_listed(names.inputs)}",
+            f"outputs {_listed(names.outputs)}",
+        ]
+        if names.disturbances:
+            parts.append(f"measured disturbances {_listed(names.disturbances)}")
+        return (
+            f"StateSpace({', '.join(parts)}, {f'dt = {self.dt:g} s' if self.is_discrete else 'continuous'})"
+        )
+
     @property
     def n_states(self) -> int:
         return len(self.A)
@@ -358,6 +371,12 @@ def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
         names=names,  # type: ignore[arg-type]
         v_op=inputs[m:],
     )
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    """The names, those after the fourth only counted."""
+    shown = [name if len(name) <= 20 else f"{name[:19]}…" for name in names[:4]]
+    return " ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _matrices(system: Any) -> tuple[Any, Any, Any, Any, float | None]:
