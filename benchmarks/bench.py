@@ -38,7 +38,7 @@ def mpc_against_bare_daqp(*, bounds: bool) -> Row:
     asked, program = closed_loop(mpc), mpc.condensed.program
     instances = [
         mpc.condensed.sample(
-            mpc.condensed.parameter(a.x, a.state.inputs[-1], a.reference, a.output_disturbance),
+            mpc.condensed.parameter.vector(a.x, a.state.inputs[-1], a.reference, a.output_disturbance),
             a.state.inputs[-1],
         )
         for a in asked

@@ -46,7 +46,7 @@ def active_share(problem: mampc.TrackingProblem, asked: Sequence[Asked]) -> floa
     broken = []
     for a in asked:
         u_previous = a.state.inputs[-1]
-        parameter = condensed.parameter(a.x, u_previous, a.reference, a.output_disturbance)
+        parameter = condensed.parameter.vector(a.x, u_previous, a.reference, a.output_disturbance)
         broken.append(condensed.sample(parameter, u_previous).margins.min() < 0)
     return float(np.mean(broken))
 
@@ -67,7 +67,7 @@ class BigM:
 
     def __init__(self, condensed, asked: Asked, most: int) -> None:
         problem, u_previous = condensed.problem, asked.state.inputs[-1]
-        parameter = condensed.parameter(asked.x, u_previous, asked.reference, asked.output_disturbance)
+        parameter = condensed.parameter.vector(asked.x, u_previous, asked.reference, asked.output_disturbance)
         sample, n, program = condensed.sample(parameter, u_previous), condensed.n_moves, condensed.program
         self.constant, self.scip = sample.constant, pyscipopt.Model()
         self.scip.hideOutput()

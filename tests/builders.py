@@ -110,4 +110,4 @@ def same_decision(a, b, atol=1e-12):
 
 def sample_data(condensed, u_previous, **parameter):
     """The condensed data of one sample."""
-    return condensed.sample(condensed.parameter(u_previous=u_previous, **parameter), u_previous)
+    return condensed.sample(condensed.parameter.vector(u_previous=u_previous, **parameter), u_previous)

@@ -132,7 +132,7 @@ class Controller(ABC):
         planned_from = self._planned_from(state, present)
         while True:
             u_previous = planned_from.inputs[-1]
-            parameter = self.condensed.parameter(
+            parameter = self.condensed.parameter.vector(
                 x, u_previous, reference, output_disturbance, input_disturbance, measured_disturbance
             )
             if not is_usable(parameter):
@@ -168,7 +168,7 @@ class Controller(ABC):
     def _may_rest(self, sample: Sample) -> bool:
         """Whether no move at all keeps the hard limits."""
         condensed = self.condensed
-        moves, inputs = slice(condensed.n_violations, condensed.program.n_simple), condensed.input_rows
+        moves, inputs = slice(condensed.n_violations, condensed.program.n_simple), condensed.bounds.input_rows
         return all(
             bool((sample.lower[rows] <= 0).all() and (sample.upper[rows] >= 0).all())
             for rows in (moves, inputs)

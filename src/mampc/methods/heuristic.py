@@ -122,6 +122,6 @@ class HeuristicSearch:
         bound = proof.objective if proof.lower_bound is None else proof.lower_bound
         if bound is None:
             return plan
-        if plan.status is Status.FEASIBLE and plan.objective - bound <= 10 * TIE * max(1e-6, sample.constant):
+        if plan.objective - bound <= 10 * TIE * max(1e-6, sample.constant):
             return plan._replace(status=Status.OPTIMAL, lower_bound=None)
         return plan._replace(lower_bound=min(bound, plan.objective))

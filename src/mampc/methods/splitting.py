@@ -75,7 +75,7 @@ class FirstStep:
         self._inverse, self._from_v = (inverse + inverse.T) / 2, 2 * mu * inverse
         self._cumulate = condensed.cumulate
         # One product gives the changes of u and every bounded quantity.
-        self._rows = np.vstack([condensed.cumulate, condensed.bounded_rows])
+        self._rows = np.vstack([condensed.cumulate, condensed.bounds.of_moves])
 
     def begin(self, sample: Sample) -> FirstStepData:
         """What the rounds of one sample share."""

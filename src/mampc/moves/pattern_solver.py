@@ -66,7 +66,7 @@ class Prepared:
         self._condensed, self._pattern, self._time_limit = condensed, pattern, time_limit
         self.chosen = np.flatnonzero(pattern)
         self._minus_inverse = -np.linalg.inv(condensed.H[self.chosen[:, None], self.chosen])
-        self._rows = condensed.bounded_rows[:, self.chosen]
+        self._rows = condensed.bounds.of_moves[:, self.chosen]
         self.bytes = 4 * (self._rows.nbytes + 20 * len(self._rows))  # with its solver, about
         self._solver: tuple[Restriction, DaqpSolver] | None = None
 

@@ -67,23 +67,23 @@ class LimitsNow:
         m, l = condensed.problem.model.n_inputs, condensed.problem.model.n_outputs
         lower, upper, u = sample.lower.copy(), sample.upper.copy(), sample.u_previous
         low, high = self.planned_min.ravel(), self.planned_max.ravel()
-        if condensed.moves_bounded:
+        if condensed.bounds.every_move:
             upper[v:n_simple] = self.du_max.ravel()
             lower[v:n_simple] = -upper[v:n_simple]
         else:
             lower[v:n_simple], upper[v:n_simple] = low[:m] - u, high[:m] - u
-        rows = condensed.input_rows
-        inputs = condensed.move_of_bound[rows]
+        rows = condensed.bounds.input_rows
+        inputs = condensed.bounds.move_of_bound[rows]
         lower[rows], upper[rows] = low[inputs] - u[inputs % m], high[inputs] - u[inputs % m]
-        usual, above, below = condensed.problem.limits, condensed.above, condensed.below
-        upper[condensed.above_rows] += self.y_max.ravel()[above - l] - usual.y_max[above % l]
-        lower[condensed.below_rows] += self.y_min.ravel()[below - l] - usual.y_min[below % l]
+        usual, above, below = condensed.problem.limits, condensed.bounds.above, condensed.bounds.below
+        upper[condensed.bounds.above_rows] += self.y_max.ravel()[above - l] - usual.y_max[above % l]
+        lower[condensed.bounds.below_rows] += self.y_min.ravel()[below - l] - usual.y_min[below % l]
         bound_of_move = np.full(condensed.n_moves, -1)
         bound_of_move[inputs] = np.arange(rows.start, rows.stop)
-        if not condensed.moves_bounded:
+        if not condensed.bounds.every_move:
             bound_of_move[:m] = np.arange(v, n_simple)
         present = BoundsNow(
-            np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), condensed.bounded_rows,
+            np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), condensed.bounds.of_moves,
             self.planned_min - u, self.planned_max - u, bound_of_move,
         )  # fmt: skip
         return Sample(sample.data, sample.parts, sample.parameter, sample.u_previous, sample.frozen, present)
@@ -107,6 +107,6 @@ def _known(condensed: CondensedQP) -> dict[str, BoolArray]:
     usual, m = condensed.problem.limits, condensed.problem.model.n_inputs
     inputs = np.isfinite(usual.u_min) | np.isfinite(usual.u_max)
     return {
-        "u_min": inputs, "u_max": inputs, "du_max": np.full(m, condensed.moves_bounded),
+        "u_min": inputs, "u_max": inputs, "du_max": np.full(m, condensed.bounds.every_move),
         "y_min": np.isfinite(usual.y_min), "y_max": np.isfinite(usual.y_max),
     }  # fmt: skip

@@ -23,11 +23,22 @@ class Parts(NamedTuple):
     moves: slice
     inputs: slice
     residual: slice
+    target: slice = slice(0)
     f: slice = slice(0)
     f_moves: slice = slice(0)
     error: slice = slice(0)
     lower: slice = slice(0)
     upper: slice = slice(0)
+
+
+class LeastSquares(NamedTuple):
+    """The cost of moves d as |U d - target|^2 + least, with U of `CondensedQP`; target has shape (n_moves,).
+
+    `least` is the cost of the free optimum U^-1 target; with limits priced in both may be anything.
+    """
+
+    target: Array
+    least: float
 
 
 class Optimum:
@@ -88,6 +99,16 @@ class Sample(Optimum):
         if bounds_now is not None:
             data[parts.lower], data[parts.upper] = bounds_now.lower, bounds_now.upper
             self._margins = bounds_now.margins(data[parts.moves])
+
+    @property
+    def target(self) -> Array:
+        """What U d should be, shape (n_moves,): moves d cost |U d - target|^2 more than the free optimum."""
+        return self.data[self.parts.target]
+
+    @property
+    def least_squares(self) -> LeastSquares:
+        """The cost of any moves, limits of outputs aside."""
+        return LeastSquares(self.target, self.cost)
 
     @property
     def f(self) -> Array:

@@ -10,16 +10,13 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
+from mampc.program.parameter import Parameter
+from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
 
 
-def tail(problem: TrackingProblem, powers: Array, n_parameters: int) -> tuple[Array, Array]:
+def tail(problem: TrackingProblem, prediction: Prediction, parameter: Parameter) -> tuple[Array, Array]:
     """Rows of the error, as a map of p, and of weighted_theta: their squares sum up to the tail of the cost.
-
-    Args:
-        problem: whose tail.
-        powers: A^0 .. A^np, shape (np + 1, n, n).
-        n_parameters: length of p.
 
     Raises:
         MampcError: a tail so long that an unstable model's errors sum up without bound.
@@ -37,26 +34,23 @@ def tail(problem: TrackingProblem, powers: Array, n_parameters: int) -> tuple[Ar
     F = np.block([[model.A, eye, zero], [0 * eye, eye, zero], [zero.T, zero.T, np.eye(l)]])
     E = np.hstack([-model.C, zero.T, np.eye(l)])
     F *= np.sqrt(gamma)
-    P = F.T @ E.T @ problem.output_weight @ E @ F
-    while F.any() and np.abs(F).max() > 1e-150:  # doubling: P_2k = P_k + F^k' P_k F^k
-        grown = P + F.T @ P @ F
-        if np.allclose(grown, P, rtol=1e-15, atol=0.0):
+    root = square_root(problem.output_weight) @ E @ F
+    while True:  # doubling, P_2k = P_k + F^k' P_k F^k, with P = root' root: squares would lose digits
+        added = root @ F
+        if (np.abs(added).max(axis=0) <= 1e-17 * np.abs(root).max(axis=0)).all():
             break
-        P, F = grown, F @ F
+        root, F = np.linalg.qr(np.vstack([root, added]), mode="r"), F @ F
 
-    forced = np.concatenate([np.zeros((1, n, model.B.shape[1])), np.cumsum(powers[:-1] @ model.B, axis=0)])
-    columns = np.split(np.arange(n_parameters), np.cumsum([n, m, m, l, model.B.shape[1] - m, 1]))
-    x, u_previous, d_u, d_y, v, one, r = columns
-    zeta = np.zeros((2 * n + l, n_parameters))
-    for row, matrix in zip(
-        (slice(n), slice(n, 2 * n), slice(2 * n, None)), (forced[-1], model.B, -model.D), strict=True
-    ):
-        zeta[row, u_previous] = zeta[row, d_u] = matrix[:, :m]
-        zeta[row, v] = matrix[:, m:]
-        zeta[row, one] = -(matrix @ model.all_inputs_op)[:, None]
-    zeta[:n, x] = powers[-1]
-    zeta[2 * n :, one] -= model.y_op[:, None]
-    zeta[2 * n :, d_y], zeta[2 * n :, r[-l:]] = -np.eye(l), np.eye(l)
+    forced = prediction.state_response
+    per_input = np.vstack([forced[-1], model.B, -model.D])  # zeta per input held from the first sample on
+    zeta = parameter.no_map(2 * n + l)
+    zeta[:, parameter.u_previous] = zeta[:, parameter.input_disturbance] = per_input[:, :m]
+    zeta[:, parameter.measured_disturbance] = per_input[:, m:]
+    zeta[:, parameter.one] = -(per_input @ model.all_inputs_op)[:, None]
+    zeta[:n, parameter.x] = prediction.final_power
+    zeta[2 * n :, parameter.one] -= model.y_op[:, None]
+    zeta[2 * n :, parameter.output_disturbance] = -np.eye(l)
+    zeta[2 * n :, parameter.final_reference] = np.eye(l)
     of_moves = np.vstack(
         [
             np.hstack([forced[problem.prediction_horizon - j][:, :m] for j in range(n_c)]),
@@ -64,7 +58,6 @@ def tail(problem: TrackingProblem, powers: Array, n_parameters: int) -> tuple[Ar
             np.tile(-model.D[:, :m], n_c),
         ]
     )
-    root = square_root(P)
     return root @ zeta, -root @ of_moves
 
 

@@ -1,0 +1,78 @@
+"""The parameter of a sample: every number that changes from sample to sample, in one vector p.
+
+    p = (x, u_prev, d_u, d_y, v, 1, r)
+
+with r either one reference (l,) that holds over the horizon, or r_0 .. r_np one after the other.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_shaped
+from mampc.program.problem import TrackingProblem
+
+
+class Parameter:
+    """Where each quantity stands in p, for a previewed reference.
+
+    Attributes:
+        x: state, a slice of n entries, as the others are slices of p.
+        u_previous: inputs until now, m entries, in engineering units.
+        input_disturbance, output_disturbance: m and l entries.
+        measured_disturbance: d entries, in engineering units.
+        one: the constant 1.
+        reference: (np + 1) l entries, in engineering units.
+        final_reference: the last l of them.
+        size: of p.
+    """
+
+    def __init__(self, problem: TrackingProblem) -> None:
+        model = problem.model
+        m, l, self._n_outputs = model.n_inputs, model.n_outputs, model.n_outputs
+        sizes = [model.n_states, m, m, l, len(model.v_op), 1, (problem.prediction_horizon + 1) * l]
+        ends = np.cumsum(sizes).tolist()
+        (
+            self.x, self.u_previous, self.input_disturbance, self.output_disturbance,
+            self.measured_disturbance, self.one, self.reference,
+        ) = (slice(end - size, end) for size, end in zip(sizes, ends, strict=True))  # fmt: skip
+        self.size = ends[-1]
+        self.final_reference = slice(self.size - l, self.size)
+        usual: tuple[Array, ...] = (np.zeros(m), np.zeros(l), model.v_op, np.ones(1))  # d_u, d_y, v, 1
+        self._usual = usual
+        self._usual_together = np.concatenate(self._usual)
+
+    def vector(
+        self,
+        x: Array,
+        u_previous: Array,
+        reference: Array,
+        output_disturbance: Any = None,
+        input_disturbance: Any = None,
+        measured_disturbance: Any = None,
+    ) -> Array:
+        """p; the reference has shape (l,) or (np + 1, l), each disturbance may be left out."""
+        if reference.ndim == 2:
+            reference = reference.ravel()
+        if output_disturbance is None and input_disturbance is None and measured_disturbance is None:
+            return np.concatenate((x, u_previous, self._usual_together, reference))
+        d_u, d_y, v, one = self._usual
+        if input_disturbance is not None:
+            d_u = as_shaped("input_disturbance", input_disturbance, d_u.shape)
+        if output_disturbance is not None:
+            d_y = as_shaped("output_disturbance", output_disturbance, d_y.shape)
+        if measured_disturbance is not None:
+            v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
+        return np.concatenate((x, u_previous, d_u, d_y, v, one, reference))
+
+    def no_map(self, rows: int) -> Array:
+        """A map of p to `rows` zeros, shape (rows, size), to be filled in."""
+        return np.zeros((rows, self.size))
+
+    def with_constant_reference(self, preview_map: Array) -> Array:
+        """The map of a p whose reference has shape (l,): the columns of all samples summed up."""
+        start, rows = self.reference.start, len(preview_map)
+        constant = preview_map[:, start:].reshape(rows, -1, self._n_outputs).sum(axis=1)
+        return np.hstack([preview_map[:, :start], constant])
