@@ -1,22 +1,138 @@
-"""Redraw the figures of the documentation from a run of the built-in study: `make figures`."""
+"""Redraw the figures of the documentation, each from a computation: `make figures`."""
 
 from pathlib import Path
 
-from mampc.loop.drawing import styled
+import numpy as np
+from scipy import signal
+
+import mampc
+from mampc.base.tolerances import SAME
+from mampc.loop.drawing import BLACK, BLUE, GREY, VERMILION, legend_above, new_figure, styled
 from mampc.report.figures import study_figures
 from mampc.study import load_study, run_study
 
 IMAGES = Path(__file__).parent / "images"
-SHOWN = {"noisy_u1", "noisy_y1", "noisy_moves-against-error"}
+SHOWN = {"noisy_overview", "noisy_moves-against-error"}
+SAMPLE = 7  # of the pattern shown: moves behind, now and ahead
+PALE = "#dce9f2"
 
 
 def main() -> None:
-    result = run_study(load_study("quadruple-tank"), print)
     IMAGES.mkdir(exist_ok=True)
-    for name, figure in study_figures(result):
-        if name in SHOWN:
-            with styled():
-                figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None})
+    save("procrastination", procrastination_figure())
+    result = run_study(load_study("quadruple-tank"), print)
+    save("move-pattern", pattern_figure(result))
+    for drawing in study_figures(result):
+        if drawing.name in SHOWN:
+            save(drawing.name, drawing.figure)
+
+
+def save(name, figure):
+    with styled():
+        figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None})
+
+
+def pattern_figure(result):
+    """One decision of the exact budget on the noisy tank: its pattern, and the inputs that come of it."""
+    run, k = result.runs["noisy"]["exact budget"], SAMPLE
+    rules = next(table.rules for table in result.study.controllers if table.name == "exact budget")
+    decision, back = run.decisions[k], rules.sparsity_horizon - 1
+    past = np.abs(np.diff(run.u[k - back - 1 : k], axis=0)) > SAME
+    ahead = len(decision.moves)
+    moved = np.vstack([past, decision.moves])
+    with styled():
+        figure, axes = new_figure(1 + run.u.shape[1], height=0.75, sharex=True)
+        grid = axes[0, 0]
+        kinds = {True: {True: ("moved", GREY), False: ("did not move", "white")},
+                 False: {True: ("may move: part of the pattern", BLUE), False: ("may not move", PALE)}}  # fmt: skip
+        for (row, i), move in np.ndenumerate(moved):
+            sample = row - back
+            name, colour = kinds[sample < 0][bool(move)]
+            grid.bar(
+                sample + 0.5,
+                0.8,
+                0.9,
+                bottom=-i - 0.4,
+                color=colour,
+                edgecolor=GREY,
+                linewidth=0.6,
+                label=name,
+            )
+        grid.set_ylim(-moved.shape[1] + 0.4, 0.6)
+        grid.set_yticks([0, -1], run.names.inputs)
+        grid.set_title(
+            f"{back} past and {ahead} future samples with {int(moved.sum())} moves; the budget is {rules.max_moves}"
+        )
+        grid.grid(False)
+        edges = np.arange(-back, ahead + 1)
+        for i, panel in enumerate(axes[1:, 0]):
+            values = np.concatenate([run.u[k - back : k, i], decision.plan[:, i]])
+            kept = np.append(values, values[-1])
+            panel.step(edges[: back + 1], kept[[*range(back), back - 1]], where="post", color=GREY)
+            panel.step(np.r_[0, edges[back:]], kept[back - 1 :], where="post", color=BLUE)
+            panel.set_title(run.names.with_unit(run.names.inputs[i]))
+            panel.margins(y=0.3)
+        for panel in axes[:, 0]:
+            panel.axvline(0, color=BLACK, linewidth=0.9, linestyle="--")
+        axes[-1, 0].set_xticks(edges, ["now" if e == 0 else f"{e:+d}" for e in edges])
+        axes[-1, 0].set_xlabel("sample, counted from now")
+        axes[-1, 0].set_xlim(-back, ahead)
+        legend_above(figure)
+    return figure
+
+
+def procrastination_figure(tail_horizon=20.0, plans=6, steps=32):
+    """The plans of successive samples after a step of the reference, without a tail and with one."""
+    plant = signal.StateSpace(signal.TransferFunction([-1.0, 1.0], [1.0, 2.0, 1.0])).to_discrete(0.25)
+    model = mampc.StateSpace(plant.A, plant.B, plant.C, None, 0.25)
+    with styled():
+        figure, axes = new_figure(2, 2, height=1.6, sharex=True, sharey="row")
+        for column, tail in zip(axes.T, (0.0, tail_horizon), strict=True):
+            problem = mampc.TrackingProblem(
+                model, prediction_horizon=8, control_horizon=8, move_weight=0.1, tail_horizon=tail
+            )
+            outputs, inputs, decisions = closed_loop(problem, mampc.MoveRules(price=1.0), steps)
+            top, bottom = column
+            for k, decision in enumerate(decisions[:plans]):
+                size = np.abs(decision.plan).max() / 0.7
+                plan, applied = decision.plan[:, 0] / size, np.array([0.0, *inputs[:k]]) / size
+                top.axhline(-k, color="#d0d0d0", linewidth=0.6)
+                top.step(
+                    np.arange(-1, k + 1),
+                    np.append(applied, applied[-1]) - k,
+                    where="post",
+                    color=GREY,
+                    label="applied",
+                )
+                values = np.concatenate([applied[-1:], plan, plan[-1:]]) - k
+                top.step(
+                    np.r_[k, k : k + len(plan) + 1], values, where="post", color=BLUE, label="plan, output"
+                )
+                for j in np.flatnonzero(decision.moves[:, 0]):
+                    top.plot(k + j, -k, "o", color=VERMILION, markersize=4, label="planned move")
+            top.set_yticks(-np.arange(plans), [f"at {k}" for k in range(plans)])
+            top.set_title(f"input as planned, {f'tail of {tail:g} samples' if tail else 'no tail'}")
+            top.grid(False, axis="y")
+            bottom.axhline(1.0, color=BLACK, linestyle="--", linewidth=0.9, label="reference")
+            bottom.plot(np.arange(steps), outputs, color=BLUE)
+            bottom.set_title("output")
+            bottom.set_xlabel("sample")
+            bottom.set_xlim(-1, plans + 10)
+            bottom.set_xticks(range(0, plans + 11, 2))
+        legend_above(figure)
+    return figure
+
+
+def closed_loop(problem, rules, steps):
+    """Outputs, inputs and decisions from rest, the reference being 1, with the plant as modelled."""
+    model, controller = problem.model, mampc.MAMPC(problem, rules)
+    state, x, outputs, decisions = controller.initial_state(), np.zeros(model.n_states), [], []
+    for _ in range(steps):
+        decisions.append(controller.step(state, x, [1.0]))
+        state = decisions[-1].state
+        outputs.append(float(model.C[0] @ x))
+        x = model.A @ x + model.B @ decisions[-1].u
+    return outputs, [float(d.u[0]) for d in decisions], decisions
 
 
 if __name__ == "__main__":

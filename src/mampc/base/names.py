@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from mampc.base.errors import MampcError
@@ -13,13 +13,15 @@ class Names:
     """Names of the inputs, outputs and states of a plant or model, each a tuple of distinct words.
 
     `disturbances` are inputs that are measured and not manipulated, such as a load; where inputs and
-    disturbances stand together in one array, the inputs come first.
+    disturbances stand together in one array, the inputs come first. `units` may give the unit of any input, output
+    or disturbance, as a mapping or as pairs of name and unit; figures show it and nothing else uses it.
     """
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     states: tuple[str, ...] = ()
     disturbances: tuple[str, ...] = ()
+    units: Mapping[str, str] | tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         for kind in ("inputs", "outputs", "states", "disturbances"):
@@ -32,6 +34,22 @@ class Names:
         together = (*self.inputs, *self.disturbances, *self.outputs)
         if len(set(together)) != len(together):
             raise MampcError(f"names: expected each input, disturbance and output once, received {together}")
+        try:
+            units = dict(self.units)
+        except (TypeError, ValueError):
+            raise MampcError(
+                f"names.units: expected a mapping of names to units, received {self.units!r}"
+            ) from None
+        if any(name not in together or not isinstance(unit, str) for name, unit in units.items()):
+            raise MampcError(
+                f"names.units: expected a text for names among {together}, received {self.units!r}"
+            )
+        object.__setattr__(self, "units", tuple(units.items()))
+
+    def with_unit(self, name: str) -> str:
+        """A name with its unit, where that is known: `u1 (%)`."""
+        unit = dict(self.units).get(name)
+        return f"{name} ({unit})" if unit else name
 
     @classmethod
     def numbered(cls, inputs: int, outputs: int, states: int = 0) -> Names:

@@ -16,6 +16,7 @@ from mampc.base.names import Names
 from mampc.controllers.decision import Decision
 from mampc.loop import metrics
 from mampc.loop.metrics import Metrics
+from mampc.program.problem import Limits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,11 +86,15 @@ class Run:
         """How often each status came."""
         return dict(Counter(decision.status.value for decision in self.decisions))
 
-    def plot(self) -> Figure:
-        """Inputs as staircases above outputs with their references; needs mampc[plot]."""
-        from mampc.loop.drawing import closed_loop_figure
+    def plot(self, *, limits: Limits | None = None) -> Figure:
+        """All outputs with their references above all inputs as staircases; needs mampc[plot].
 
-        return closed_loop_figure(self.t, self.u, self.y, self.r, self.names)
+        Args:
+            limits: to be shown too, such as `problem.limits`.
+        """
+        from mampc.loop.drawing import BLUE, Look, signals_figure
+
+        return signals_figure({"closed loop": self}, look={"closed loop": Look(BLUE)}, limits=limits)
 
     def to_csv(self, path: str | Path) -> None:
         """Write time, inputs, measured disturbances, outputs, references, status, remarks and ignored outputs, in

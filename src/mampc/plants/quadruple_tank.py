@@ -40,7 +40,9 @@ class QuadrupleTank:
     u_op: tuple[float, ...] = parameter((50.0, 50.0), "%", _PAPER)
 
     x_min: ClassVar[float] = 0.0
-    names: ClassVar[Names] = Names(("u1", "u2"), ("y1", "y2"), ("h1", "h2", "h3", "h4"))
+    names: ClassVar[Names] = Names(
+        ("u1", "u2"), ("y1", "y2"), ("h1", "h2", "h3", "h4"), units={"u1": "%", "u2": "%"}
+    )
 
     def __post_init__(self) -> None:
         for name, size in (("areas", 4), ("outlets", 4), ("k_pump", 2), ("gamma", 2), ("u_op", 2)):

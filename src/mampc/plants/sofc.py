@@ -76,7 +76,11 @@ class SolidOxideFuelCell:
 
     x_min: ClassVar[float] = 0.0
     names: ClassVar[Names] = Names(
-        ("fuel", "air"), ("voltage",), ("p_H2", "p_H2O", "p_O2", "p_N2"), disturbances=("current",)
+        ("fuel", "air"),
+        ("voltage",),
+        ("p_H2", "p_H2O", "p_O2", "p_N2"),
+        disturbances=("current",),
+        units={"fuel": "%", "air": "%", "voltage": "V", "current": "A"},
     )
 
     def __post_init__(self) -> None:

@@ -1,150 +1,210 @@
-"""Figures for a paper or a report: staircase inputs, outputs with references, excitation, validation."""
+"""Figures for a paper or a report: closed loops, moves against error, excitation, validation, sensitivity."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mampc.base.checks import Array
 from mampc.compare.sweep import Point
 from mampc.identification import IOData, Validation
-from mampc.loop.drawing import COLOURS, WIDE, label, new_figure, styled, time_scale
+from mampc.loop.drawing import (
+    BLACK,
+    BLUE,
+    GREY,
+    VERMILION,
+    Look,
+    legend_above,
+    looks,
+    new_figure,
+    plain,
+    signals_figure,
+    styled,
+    time_scale,
+)
 from mampc.loop.run import Run
+from mampc.report.labels import label_points
+from mampc.report.tables import baseline
 from mampc.study import StudyResult
 from mampc.study.schema import file_word
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SHOWN_OF_EXCITATION = 400  # samples
 
 
-def study_figures(result: StudyResult) -> Iterator[tuple[str, Figure]]:
-    """File name and figure, one at a time, for everything a study has to show."""
-    names = result.model.names
+class Drawing(NamedTuple):
+    """A figure, the name of its file without ending, and what it shows in a sentence."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+def study_figures(result: StudyResult) -> Iterator[Drawing]:
+    """Everything a study has to show, one figure at a time."""
     if result.data is not None:
-        yield "prbs-inputs", _record_figure(result.data, names.inputs, result.data.u, staircase=True)
-        yield "prbs-outputs", _record_figure(result.data, names.outputs, result.data.y, staircase=False)
+        yield from _excitation(result.data)
+    look = result_looks(result)
+    limits = result.study.problem.limits
     for scenario, runs in result.runs.items():
-        for i, name in enumerate(names.inputs):
-            yield f"{file_word(scenario)}_{file_word(name)}", _comparison(runs, i, name, "input")
-        for i, name in enumerate(names.outputs):
-            yield f"{file_word(scenario)}_{file_word(name)}", _comparison(runs, i, name, "output")
-        yield f"{file_word(scenario)}_moves-against-error", moves_against_error(runs, result.study.threshold)
+        names = next(iter(runs.values())).names
+        word, where = file_word(scenario), f"scenario {scenario}, {_length(result)}"
+        yield Drawing(
+            f"{word}_overview",
+            f"All outputs and inputs, {where}.",
+            signals_figure(runs, look=look, limits=limits),
+        )
+        for kind, signals in (("Output", names.outputs), ("Input", names.inputs)):
+            for name in signals:
+                yield Drawing(
+                    f"{word}_{file_word(name)}",
+                    f"{kind} {names.with_unit(name)}, {where}.",
+                    signals_figure(runs, [name], look=look, limits=limits, height=1.9),
+                )
+        yield Drawing(
+            f"{word}_moves-against-error",
+            f"How often inputs move against how well outputs follow, {where}; best is down to the left.",
+            moves_against_error(runs, result.study.threshold, look),
+        )
+
+
+def result_looks(result: StudyResult) -> dict[str, Look]:
+    """The look of each controller, the same in all figures: the baseline and the two best of the others stand out.
+
+    The best have the smallest sum of moves and error, both as shares of the baseline's, over all scenarios.
+    """
+    base = baseline(result.study).name
+    merit = dict.fromkeys(next(iter(result.runs.values())), 0.0)
+    for runs in result.runs.values():
+        metrics = {name: run.metrics(threshold=result.study.threshold) for name, run in runs.items()}
+        for figures in (
+            {name: float(m.sparse_density.sum()) for name, m in metrics.items()},
+            {name: m.tracking_error for name, m in metrics.items()},
+        ):
+            unit = figures[base] or max(figures.values()) or 1.0
+            for name in merit:
+                merit[name] += figures[name] / unit
+    others = sorted((name for name in merit if name != base), key=lambda name: merit[name])
+    return looks(list(merit), [base, *others[:2]])
+
+
+def moves_against_error(
+    runs: Mapping[str, Run], threshold: float, look: Mapping[str, Look] | None = None
+) -> Figure:
+    """Each controller as a point: how often its inputs move, and how well its outputs follow.
+
+    The points bear names, or numbers and a legend where there is no room for names.
+
+    Args:
+        runs: controller -> run.
+        threshold: changes above it count, in input units.
+        look: controller -> how it is drawn; default by their order.
+    """
+    look = looks(list(runs), list(runs)[:3]) if look is None else look
+    with styled():
+        figure, [[panel]] = new_figure(height=2.8)
+        points, markers = [], []
+        for controller, run in runs.items():
+            metrics = run.metrics(threshold=threshold)
+            points.append((100 * float(np.mean(metrics.sparse_density)), metrics.tracking_error))
+            style = look[controller]
+            markers += panel.plot(*points[-1], "o", color=style.colour, markersize=7, zorder=style.order)
+        panel.set_xlabel(f"samples with a move above {threshold:g}, mean of all inputs (%)")
+        panel.set_ylabel("tracking error, mean |y − r|²")
+        right, top = np.max(points, axis=0)
+        panel.set_xlim(0, 1.2 * right or 1.0)
+        panel.set_ylim(0, 1.2 * top or 1.0)
+        front = [look[controller].order > 3 for controller in runs]
+        if not label_points(panel, points, [plain(name, 28) for name in runs], front):
+            numbers = [str(i + 1) for i in range(len(runs))]
+            for marker, number, name in zip(markers, numbers, runs, strict=True):
+                marker.set_label(plain(f"{number}  {name}"))
+            legend_above(figure)
+            label_points(panel, points, numbers, front)
+    return figure
 
 
 def validation_figure(data: IOData, validation: Validation) -> Figure:
     """Measured and simulated outputs of a record the model has not seen."""
-    l = data.y.shape[1]
+    time = np.arange(len(data)) * data.dt
+    scale, unit = time_scale(time)
     with styled():
-        figure, axes = new_figure(l, 1, figsize=(6.5, 1.0 + 1.6 * l), sharex=True)
-        time = np.arange(len(data)) * data.dt
-        scale, unit = time_scale(time)
+        figure, axes = new_figure(data.y.shape[1], sharex=True)
         for i, panel in enumerate(axes[:, 0]):
-            panel.plot(time / scale, data.y[:, i], color=COLOURS[0], label="measured")
-            panel.plot(time / scale, validation.y_hat[:, i], color=COLOURS[1], label="simulated by the model")
-            panel.set_ylabel(label(data.names.outputs[i]))
-            panel.set_title(f"fit {validation.fit[i]:.1f} %", loc="right")
-        axes[0, 0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+            panel.plot(time / scale, data.y[:, i], color=GREY, label="measured")
+            panel.plot(time / scale, validation.y_hat[:, i], color=BLUE, label="simulated by the model")
+            name = data.names.with_unit(data.names.outputs[i])
+            panel.set_title(plain(f"{name}, fit {validation.fit[i]:.1f} %"))
         axes[-1, 0].set_xlabel(f"time ({unit}), hold-out part of the record")
+        axes[-1, 0].set_xlim(0, time[-1] / scale or None)
+        legend_above(figure)
     return figure
 
 
-def _comparison(runs: dict[str, Run], i: int, name: str, kind: str) -> Figure:
-    """One signal of several runs."""
-    with styled():
-        figure, [[panel]] = new_figure(figsize=WIDE)
-        first = next(iter(runs.values()))
-        scale, unit = time_scale(first.t)
-        if kind == "output":
-            panel.step(
-                first.t / scale, first.r[:, i], where="post", color="black", linestyle="--", linewidth=1.0,
-                label="reference",
-            )  # fmt: skip
-        for (controller, run), colour in zip(runs.items(), _colours(), strict=False):
-            if kind == "input":
-                panel.step(run.t / scale, run.u[:, i], where="post", color=colour, label=label(controller))
-            else:
-                panel.plot(run.t / scale, run.y[:, i], color=colour, label=label(controller))
-        _label(panel, name, unit)
-    return figure
-
-
-def moves_against_error(runs: dict[str, Run], threshold: float) -> Figure:
-    """Each controller as a point: how often its inputs change, and how well its outputs follow."""
-    with styled():
-        figure, [[panel]] = new_figure(figsize=(4.2, 3.2))
-        for (controller, run), colour in zip(runs.items(), _colours(), strict=False):
-            metrics = run.metrics(threshold=threshold)
-            share = 100 * float(np.mean(metrics.sparse_density))
-            panel.plot(share, metrics.tracking_error, "o", color=colour, markersize=7)
-            panel.annotate(
-                label(controller),
-                (share, metrics.tracking_error),
-                xytext=(6, 5),
-                textcoords="offset points",
-                fontsize=8,
-            )
-        panel.set_xlabel(f"samples at which an input changes by more than {threshold:g} (%)")
-        panel.set_ylabel("tracking error")
-        panel.margins(x=0.25, y=0.25)
-        panel.set_xlim(left=0)
-        panel.set_ylim(bottom=0)
-    return figure
-
-
-def sensitivity_figure(points: list[Point], settings: dict[str, str]) -> Figure:
+def sensitivity_figure(points: list[Point], settings: Mapping[str, str]) -> Figure:
     """Ratios to plain MPC as one setting changes at a time, a panel a setting."""
     shown = [setting for setting in settings if any(point.setting == setting for point in points)]
-    columns = 4
+    columns = min(3, len(shown))
     with styled():
-        rows = -(-len(shown) // columns)
-        figure, axes = new_figure(rows, columns, figsize=(9.0, 2.3 * rows), sharey=True)
+        figure, axes = new_figure(-(-len(shown) // columns), columns, sharey=True)
         for panel in axes.flat[len(shown) :]:
             panel.set_visible(False)
         for setting, panel in zip(shown, axes.flat, strict=False):
             own = [point for point in points if point.setting == setting]
             values = [point.value for point in own]
             for ratios, name, colour in (
-                ([point.changes_ratio for point in own], "changes / MPC", COLOURS[1]),
-                ([point.error_ratio for point in own], "error / MPC", COLOURS[2]),
+                ([point.changes_ratio for point in own], "changes / MPC", BLUE),
+                ([point.error_ratio for point in own], "error / MPC", VERMILION),
             ):
                 heights = [np.nan if ratio is None else ratio for ratio in ratios]
-                panel.plot(values, heights, "o-", color=colour, label=name)
-            panel.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
+                panel.plot(values, heights, "o-", color=colour, markersize=4, label=name)
+            panel.axhline(1.0, color=BLACK, linewidth=0.8, linestyle="--", label="plain MPC")
             if min(values) > 0 and max(values) / min(values) >= 50:
                 panel.set_xscale("log")
-            panel.set_xlabel(settings[setting])
-        axes[0, 0].legend(loc="best")
+            panel.set_xticks(values, [f"{value:g}" for value in values])
+            panel.minorticks_off()
+            panel.set_title(plain(settings[setting], 28))
+        legend_above(figure)
     return figure
 
 
-def _record_figure(data: IOData, names: tuple[str, ...], signals: Array, staircase: bool) -> Figure:
-    """The first part of the record, one panel a signal."""
-    shown = slice(0, SHOWN_OF_EXCITATION)
-    time = np.arange(len(data))[shown] * data.dt
+def _excitation(data: IOData) -> Iterator[Drawing]:
+    """The first part of the record that a model was identified from."""
+    names = data.names
+    for kind, signals, values in (
+        ("inputs", names.inputs + names.disturbances, data.u),
+        ("outputs", names.outputs, data.y),
+    ):
+        what = f"the first {SHOWN_OF_EXCITATION}" if len(data) > SHOWN_OF_EXCITATION else "all"
+        yield Drawing(
+            f"prbs-{kind}",
+            f"The {kind} of the record that the model was identified from, {what} of its {len(data)} samples.",
+            _record_figure(data, signals, values[:SHOWN_OF_EXCITATION], kind == "inputs"),
+        )
+
+
+def _record_figure(data: IOData, signals: tuple[str, ...], values: Array, staircase: bool) -> Figure:
+    time = np.arange(len(values)) * data.dt
     scale, unit = time_scale(time)
     with styled():
-        figure, axes = new_figure(len(names), 1, figsize=(6.5, 1.0 + 1.3 * len(names)), sharex=True)
-        for i, panel in enumerate(axes[:, 0]):
-            if staircase:
-                panel.step(time / scale, signals[shown, i], where="post", color=COLOURS[1], linewidth=1.0)
-            else:
-                panel.plot(time / scale, signals[shown, i], color=COLOURS[1], linewidth=1.0)
-            panel.set_ylabel(label(names[i]))
+        figure, axes = new_figure(len(signals), height=1.2, sharex=True)
+        for name, column, panel in zip(signals, values.T, axes[:, 0], strict=True):
+            panel.plot(
+                time / scale,
+                column,
+                drawstyle="steps-post" if staircase else "default",
+                color=BLUE,
+                linewidth=1.0,
+            )
+            panel.set_title(plain(data.names.with_unit(name)))
         axes[-1, 0].set_xlabel(f"time ({unit})")
+        axes[-1, 0].set_xlim(0, time[-1] / scale or None)
     return figure
 
 
-def _label(panel: Axes, name: str, unit: str) -> None:
-    panel.set_xlabel(f"time ({unit})")
-    panel.set_ylabel(label(name))
-    panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, borderaxespad=0.2)
-
-
-def _colours() -> Iterator[str]:
-    while True:
-        yield from COLOURS
+def _length(result: StudyResult) -> str:
+    return f"{result.study.steps} samples of {result.study.dt:g} s"

@@ -81,9 +81,9 @@ def run_and_write(
     result = run_study(study, on_stage, on_begin=begin, on_run=files.trajectory)
     missing = None
     try:
-        for name, figure in study_figures(result):
-            on_stage(f"figure {name}")
-            files.figure(name, figure)
+        for drawing in study_figures(result):
+            on_stage(f"figure {drawing.name}")
+            files.figure(drawing.name, drawing.figure)
     except MampcError as error:
         missing = str(error)
     return result, files.summary(result), missing

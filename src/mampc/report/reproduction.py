@@ -134,15 +134,17 @@ def _write_case(page: Page, case: Case, folder: ResultFolder) -> None:
             "the ratios of both to MPC."
         )
         page.table(*_table(case, part))
-    for figure_name, figure in study_figures(case.result):
-        page.figure(files.figure(figure_name, figure), figure_name.replace("-", " "))
+    for drawing in study_figures(case.result):
+        page.figure(files.figure(drawing.name, drawing.figure), drawing.caption)
     page.heading(f"Sensitivity: {name}", 3)
     page.text(
         f"{_papers(case.study)[-1].name} in the {case.study.scenarios[-1].name} scenario, one setting "
         "changed at a time; ratios to MPC with the same setting."
     )
     figure = sensitivity_figure(case.points, SETTINGS)
-    page.figure(files.figure("sensitivity", figure), "ratios to MPC as one setting changes")
+    page.figure(
+        files.figure("sensitivity", figure), "Moves and error as ratios to plain MPC, as one setting changes."
+    )
     rows = [
         [SETTINGS[point.setting], f"{point.value:g}", _text(point.changes_ratio), _text(point.error_ratio)]
         for point in case.points
