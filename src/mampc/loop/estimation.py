@@ -13,6 +13,8 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_vector
 from mampc.base.errors import MampcError
+from mampc.loop.disturbances import Directions, alike, directions_of, response_within_reach
+from mampc.systems.riccati import predicted_covariance
 from mampc.systems.state_space import StateSpace
 
 
@@ -26,7 +28,7 @@ class Estimate:
 
 
 class KalmanFilter:
-    """A stationary Kalman filter for a model augmented with one integrating disturbance per output.
+    """A stationary Kalman filter for a model augmented with integrating disturbances.
 
     Build it with `offset_free`. Outputs that are missing drop out of the correction: those that are left
     correct with the gain that the same covariances give them, no larger than in every-day operation, so that
@@ -34,12 +36,12 @@ class KalmanFilter:
 
     Args:
         model: the discrete model.
-        directions: how the l disturbances act: (m, l) at the inputs, or None for at the outputs.
-        covariance: of the predicted state and disturbances, stationary, shape (n + l, n + l).
+        directions: how the disturbances act.
+        covariance: of the predicted state and disturbances, stationary, in that order.
         noise: covariance of the measurement noise, shape (l, l).
     """
 
-    def __init__(self, model: StateSpace, directions: Array | None, covariance: Array, noise: Array) -> None:
+    def __init__(self, model: StateSpace, directions: Directions, covariance: Array, noise: Array) -> None:
         self.model, self.directions = model, directions
         self._covariance, self._noise = covariance, noise
         self._A, self._C = _augmented(model, directions)
@@ -55,26 +57,30 @@ class KalmanFilter:
         cls,
         model: StateSpace,
         *,
-        disturbance: str = "output",
-        measurement_noise: Any = 1.0,
-        drift: Any = 0.3,
+        disturbance: str = "auto",
+        measurement_noise: Any = None,
+        drift: Any = None,
         input_noise: Any = None,
     ) -> KalmanFilter:
-        """A filter with one integrating disturbance per output.
+        """A filter with as many integrating disturbances as outputs, where the inputs can make up for them.
 
-        Only ratios of the three standard deviations matter, so that the defaults suit any units: they
-        filter noise over some three to ten samples.
+        Only ratios of the three standard deviations matter. The defaults suit any units and filter noise over
+        some three to ten samples.
 
         Args:
             model: a discrete model.
-            disturbance: "output" for steps at the outputs (stable models), "input" for steps at the
-                inputs (integrating models too; needs at least as many inputs as outputs; with more of
-                them, disturbances act along the inputs' combinations that move the outputs).
-            measurement_noise: standard deviation of the noise of each output, scalar or (l,).
-            drift: standard deviation by which each disturbance wanders in a sample, in the unit of
-                `measurement_noise` (for "input": as seen through the model's gain), scalar or (l,).
+            disturbance: "output" for steps at the outputs, which recover from loads as slowly as the plant
+                does by itself; "input" for steps at the inputs (needs at least as many inputs as outputs;
+                with more of them, disturbances act along the inputs' combinations that move the outputs);
+                "auto" for steps at the inputs that drive slow, integrating and unstable modes, and at the
+                outputs that these leave.
+            measurement_noise: standard deviation of the noise of each output, scalar or (l,), in output
+                units; default what `model.noise` says, else sizes that are alike beside what inputs do.
+            drift: standard deviation by which each disturbance wanders in a sample, in output units (at the
+                inputs: as it shows in the outputs within `REACH` samples), scalar or (l,); default 0.3 times
+                the measurement noise.
             input_noise: standard deviation of noise at the inputs, scalar or (m,), in input units; the
-                default is what moves the outputs at rest by about the measurement noise.
+                default is what moves the outputs within `REACH` samples by the measurement noise.
 
         Raises:
             MampcError: a continuous model, or one whose disturbances cannot be told apart from its
@@ -84,33 +90,35 @@ class KalmanFilter:
             raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
         if not model.is_discrete:
             raise MampcError("offset_free: expected a discrete model, received dt = 0; discretise it first")
-        if disturbance not in ("output", "input"):
-            raise MampcError(f"disturbance: expected 'output' or 'input', received {disturbance!r}")
+        if disturbance not in ("auto", "output", "input"):
+            raise MampcError(f"disturbance: expected 'auto', 'output' or 'input', received {disturbance!r}")
         n, m, l = model.n_states, model.n_inputs, model.n_outputs
-        at_output = disturbance == "output"
-        if not at_output and m < l:
+        if disturbance == "input" and m < l:
             raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")
-        response = static_response(model)
-        size = float(np.sqrt(np.mean(response**2))) or 1.0
-        directions = None if at_output else np.eye(m) if m == l else response.T / (size * np.sqrt(l))
+        reach = response_within_reach(model)
+        noise = (
+            alike(reach)
+            if measurement_noise is None
+            else _positive("measurement_noise", measurement_noise, l)
+        )
+        effect = np.linalg.norm(reach / noise[:, None], axis=0) / np.sqrt(l)
+        unit = np.where(
+            effect > 0, 1 / np.where(effect > 0, effect, 1.0), 0.0
+        )  # of inputs: as large as noise
+        directions = directions_of(model, disturbance, reach, noise, unit)
         A, C = _augmented(model, directions)
-        _require_detectable(A, C, at_output)
-        noise = _positive("measurement_noise", measurement_noise, l)
-        excitation = noise.mean() / size if input_noise is None else _positive("input_noise", input_noise, m)
-        wander = _positive("drift", drift, l) * (1.0 if at_output else 1 / size)
-        from scipy.linalg import solve_discrete_are
-
-        driven = model.B[:, :m] * excitation
-        Q = np.zeros((n + l, n + l))
+        _require_detectable(A, C / noise[:, None], disturbance)
+        wander = 0.3 * noise if drift is None else _positive("drift", drift, l)
+        moving = unit if input_noise is None else _positive("input_noise", input_noise, m)
+        driven = model.B[:, :m] * moving
+        Q = np.zeros((len(A), len(A)))
         Q[:n, :n] = driven @ driven.T + 1e-10 * np.trace(driven @ driven.T) * np.eye(n)
-        Q[n:, n:] = np.diag(wander**2)
+        Q[n:, n:] = np.diag(directions.sizes(wander / noise) ** 2)
         R = np.diag(noise**2)
         try:
-            P = solve_discrete_are(A.T, C.T, Q, R)
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise MampcError(
-                f"offset_free: expected a detectable model, the Riccati equation failed: {error}"
-            ) from None
+            P = predicted_covariance(A, C, Q, R)
+        except MampcError as error:
+            raise MampcError(f"offset_free: {error}") from None
         return cls(model, directions, P, R)
 
     def gain_with(self, believed: BoolArray) -> Array:
@@ -145,10 +153,10 @@ class KalmanFilter:
         if y is None:
             return replace(none, x=model.steady_state(np.concatenate([u, model.v_op if v is None else v])))
         # x = A x + B change + (disturbances), y = y_op + C x + D change + (disturbances)
-        A, C = _augmented(model, self.directions)
-        at_rest = np.vstack([np.eye(n, n + l) - A[:n], C])
-        wanted = np.concatenate([model.B @ change, as_vector("y", y, l) - model.y_op - model.D @ change])
-        rest = np.linalg.lstsq(at_rest, wanted)[0]
+        A, C, noise = self._A, self._C, np.sqrt(np.diag(self._noise))
+        at_rest = np.vstack([np.eye(n, len(A)) - A[:n], C / noise[:, None]])
+        explained = as_vector("y", y, l) - model.y_op - model.D @ change
+        rest = np.linalg.lstsq(at_rest, np.concatenate([model.B @ change, explained / noise]))[0]
         return self._disturbed(none, rest[:n], rest[n:])
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> Estimate:
@@ -181,11 +189,9 @@ class KalmanFilter:
         return self._disturbed(predicted, predicted.x + correction[:n], correction[n:])
 
     def _disturbed(self, estimate: Estimate, x: Array, further: Array) -> Estimate:
-        """The estimate with another state x, shape (n,), and further disturbances, shape (l,)."""
-        at_outputs, at_inputs = estimate.output_disturbance, estimate.input_disturbance
-        if self.directions is None:
-            return Estimate(x, at_outputs + further, at_inputs)
-        return Estimate(x, at_outputs, at_inputs + self.directions @ further)
+        """The estimate with another state x, shape (n,), and further disturbances along the directions."""
+        at_inputs, at_outputs = self.directions.at_inputs @ further, self.directions.at_outputs @ further
+        return Estimate(x, estimate.output_disturbance + at_outputs, estimate.input_disturbance + at_inputs)
 
     def _change(self, estimate: Estimate, u: Array, v: Array | None) -> Array:
         """All inputs of the model as differences from the operating point, shape (m + d,)."""
@@ -201,27 +207,30 @@ class KalmanFilter:
         return y
 
 
-def _augmented(model: StateSpace, directions: Array | None) -> tuple[Array, Array]:
+def _augmented(model: StateSpace, directions: Directions) -> tuple[Array, Array]:
     """A and C of the model with integrating disturbances as further states."""
-    n, m, l = model.n_states, model.n_inputs, model.n_outputs
-    at_states = np.zeros((n, l)) if directions is None else model.B[:, :m] @ directions
-    at_outputs = np.eye(l) if directions is None else model.D[:, :m] @ directions
-    A = np.block([[model.A, at_states], [np.zeros((l, n)), np.eye(l)]])
-    return A, np.hstack([model.C, at_outputs])
+    n, m = model.n_states, model.n_inputs
+    at_inputs, at_outputs = directions.at_inputs, directions.at_outputs
+    count = at_inputs.shape[1]
+    A = np.block([[model.A, model.B[:, :m] @ at_inputs], [np.zeros((count, n)), np.eye(count)]])
+    return A, np.hstack([model.C, at_outputs + model.D[:, :m] @ at_inputs])
 
 
-def _require_detectable(A: Array, C: Array, at_output: bool) -> None:
+def _require_detectable(A: Array, C: Array, disturbance: str) -> None:
     """Every mode that does not decay must show in the outputs (Hautus test)."""
     n = len(A)
     scale = max(1.0, float(np.abs(C).max()))
+    tested: list[complex] = []
     for pole in np.linalg.eigvals(A):
-        if abs(pole) >= 1 - 1e-9:
+        if abs(pole) >= 1 - 1e-9 and all(abs(pole - other) > 1e-9 for other in tested):
+            tested.append(pole)
             seen = np.linalg.svd(np.vstack([A - pole * np.eye(n), C / scale]), compute_uv=False)[-1]
             if seen < 1e-9:
-                hint = "; for an integrating model use disturbance='input'" if at_output else ""
+                hint = "; for an integrating model use disturbance='input', or the default"
                 raise MampcError(
-                    "offset_free: expected states and disturbances observable from the outputs, received a "
-                    f"model whose mode at {pole:.4g} cannot be told from a disturbance{hint}"
+                    "offset_free: expected states and disturbances observable from the outputs, received a model "
+                    f"whose mode at {pole:.4g} cannot be told from a disturbance"
+                    f"{hint if disturbance == 'output' else ''}"
                 )
 
 

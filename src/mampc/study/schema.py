@@ -195,9 +195,9 @@ class ControllerTable(Table):
 
 
 class EstimatorTable(Table):
-    disturbance: Literal["output", "input"] = "output"
-    measurement_noise: Values = 1.0
-    drift: Values = 0.3
+    disturbance: Literal["auto", "output", "input"] = "auto"
+    measurement_noise: Values | None = None
+    drift: Values | None = None
     input_noise: Values | None = None
 
 
