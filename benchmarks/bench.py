@@ -117,6 +117,20 @@ class Transcription:
         return u.T
 
 
+def regulator_against_mpc() -> Row:
+    """Output feedback (checks of sensors, estimator, MPC) against the MPC step in it, on the same samples."""
+    mpc = mampc.MPC(tank_problem())
+    asked, regulator = closed_loop(mpc), mampc.Regulator(mpc)
+    y_op, noise = mpc.problem.model.y_op, np.random.default_rng(0)
+    state, ours = regulator.initial_state(), []
+    for a in asked:
+        y = y_op + 0.1 * noise.standard_normal(len(y_op))
+        ours.append(partial(regulator.step, state, y, a.reference))
+        state = ours[-1]().state
+    times = interleaved([(ours, steps_of(mpc, asked))] * 100)
+    return Row("Regulator.step / MPC step", "at most 3", f"{times.ratio:.2f}", str(times), times.ratio <= 3)
+
+
 def alternating_against_cvxpy() -> Row:
     """The alternating method per step against the transcription, on the same samples."""
     problem = tank_problem()
@@ -167,6 +181,7 @@ def import_time() -> Row:
 ROWS: list[Callable[[], Row]] = [
     partial(mpc_against_bare_daqp, bounds=False),
     partial(mpc_against_bare_daqp, bounds=True),
+    regulator_against_mpc,
     alternating_against_cvxpy,
     *sparse.ROWS,
     import_time,

@@ -45,7 +45,8 @@ class ActuatorState:
 
     def decided(self, u: Array) -> ActuatorState:
         """What is remembered after the inputs u (m,) were decided."""
-        return replace(self, commands=(*self.commands[1:], u))
+        commands = (*self.commands[1:], u)
+        return ActuatorState(commands, self.reported, self.late, self.offset, self.manual)
 
 
 class Actuators:

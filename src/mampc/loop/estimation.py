@@ -7,15 +7,18 @@ estimated with the state, remove steady offset under any constant model error or
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray, as_vector
+from mampc.base.checks import Array, BoolArray, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.loop.disturbances import Directions, alike, directions_of, response_within_reach
 from mampc.systems.riccati import predicted_covariance
 from mampc.systems.state_space import StateSpace
+
+_ONE = np.ones(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +28,20 @@ class Estimate:
     x: Array
     output_disturbance: Array
     input_disturbance: Array
+
+
+class Updated(NamedTuple):
+    """One sample's estimate with every measurement believed, and what the sensor checks need to judge them.
+
+    Attributes:
+        estimate: predicted and corrected.
+        innovation: measured less predicted outputs, shape (l,).
+        movement: how far the model moved the outputs since the last sample, shape (l,).
+    """
+
+    estimate: Estimate
+    innovation: Array
+    movement: Array
 
 
 class KalmanFilter:
@@ -47,10 +64,12 @@ class KalmanFilter:
         self._A, self._C = _augmented(model, directions)
         self._gains: dict[bytes, Array] = {}
         self.gain = self.gain_with(np.ones(model.n_outputs, dtype=bool))
+        self._update, self._parts = self._everyday()
 
     def __repr__(self) -> str:
-        where = "outputs" if self.directions is None else "inputs"
-        return f"KalmanFilter({self.model!r}, {self.model.n_outputs} disturbances at its {where})"
+        at_inputs = int(self.directions.at_inputs.any(axis=0).sum())
+        count = self.directions.at_inputs.shape[1]
+        return f"KalmanFilter({self.model!r}, {count} disturbances, {at_inputs} of them at inputs)"
 
     @classmethod
     def offset_free(
@@ -158,6 +177,45 @@ class KalmanFilter:
         explained = as_vector("y", y, l) - model.y_op - model.D @ change
         rest = np.linalg.lstsq(at_rest, np.concatenate([model.B @ change, explained / noise]))[0]
         return self._disturbed(none, rest[:n], rest[n:])
+
+    def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
+        """Predict and correct in one matrix product, with every output believed; None if some number is not usable.
+
+        Args:
+            last: the estimate at the last sample.
+            u: inputs applied since, shape (m,).
+            y: measurements, shape (l,), taken just before the inputs are replaced.
+            v_last, v: measured disturbances at the last sample and now, shape (d,).
+        """
+        known = np.concatenate(
+            (last.x, last.output_disturbance, last.input_disturbance, u, v_last, v, y, _ONE)
+        )
+        if not is_usable(known):
+            return None
+        data = self._update.dot(known)
+        if not is_usable(data):
+            return None
+        x, at_outputs, at_inputs, innovation, movement = self._parts
+        return Updated(Estimate(data[x], data[at_outputs], data[at_inputs]), data[innovation], data[movement])
+
+    def _everyday(self) -> tuple[Array, list[slice]]:
+        """The matrix of `update`, and where the parts of its result stand."""
+        model = self.model
+        n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
+        sizes = (n, l, m, m, d, d, l, 1)
+        # Each of these is a map from all that is known to one part of it.
+        unit = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
+        x, at_outputs, at_inputs, u, v_last, v, y, one = unit
+        moved = np.vstack([u + at_inputs, v_last]) - np.outer(model.all_inputs_op, one)
+        seen = np.vstack([u + at_inputs, v]) - np.outer(model.all_inputs_op, one)
+        predicted = model.A @ x + model.B @ moved
+        innovation = y - np.outer(model.y_op, one) - model.C @ predicted - model.D @ seen - at_outputs
+        correction = self.gain @ innovation
+        at_outputs = at_outputs + self.directions.at_outputs @ correction[n:]
+        at_inputs = at_inputs + self.directions.at_inputs @ correction[n:]
+        rows = (predicted + correction[:n], at_outputs, at_inputs, innovation, model.C @ (predicted - x))
+        ends = np.cumsum([0, *map(len, rows)]).tolist()
+        return np.vstack(rows), [slice(*pair) for pair in pairwise(ends)]
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> Estimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since; what is estimated stays."""

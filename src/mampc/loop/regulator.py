@@ -13,8 +13,8 @@ from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.loop.actuators import LATEST, Actuators
-from mampc.loop.estimation import KalmanFilter
-from mampc.loop.sensors import SensorChecks
+from mampc.loop.estimation import Estimate, KalmanFilter
+from mampc.loop.sensors import Judged, SensorChecks, SensorState
 from mampc.loop.state import RegulatorState
 from mampc.program.daqp import active_flags
 from mampc.program.problem import Limits
@@ -165,26 +165,7 @@ class Regulator:
         v = v_last
         if measured_disturbance is not None:
             v = _where_usable(as_shaped("measured_disturbance", measured_disturbance, self._v_shape), v_last)
-        estimator, last = self.estimator, state.estimate
-        estimate = estimator.predict(last, u_previous, v_last)
-        estimated = (estimate.x, estimate.output_disturbance, estimate.input_disturbance)
-        if not all(is_usable(part) for part in estimated):
-            # It ran away without measurements: start again.
-            last = estimate = estimator.initial(u_previous, None, v_last)
-        # Measurements show v at once and u later.
-        innovation = estimator.innovation(estimate, u_previous, y, v)
-        movement = estimator.model.C @ (estimate.x - last.x)
-        judged, sensors = self._sensors.update(
-            state.sensors, y, innovation, movement, last.output_disturbance
-        )
-        if not judged.faults:
-            estimate = estimator.corrected(estimate, innovation)
-        else:
-            if judged.newly_stuck.any():
-                disturbance = np.where(judged.newly_stuck, sensors.disturbance, estimate.output_disturbance)
-                estimate = replace(estimate, output_disturbance=disturbance)
-            if judged.believed.any():
-                estimate = estimator.corrected(estimate, innovation, judged.believed)
+        estimate, judged, sensors = self._estimate(state, u_previous, y, v)
         blind = sensors.blind > self.max_blind_steps
         decision = self.controller.step(
             memory,
@@ -202,6 +183,40 @@ class Regulator:
             ignored_outputs=judged.faults,
             solve_time=perf_counter() - start,
         )
+
+    def _estimate(
+        self, state: RegulatorState, u: Array, y: Array, v: Array
+    ) -> tuple[Estimate, Judged, SensorState]:
+        """The estimate after the measurements y (l,), what is believed of these, and the sensors' next state.
+
+        Args:
+            state: of the last sample.
+            u: inputs applied since, shape (m,).
+            y: measurements, finite or not.
+            v: measured disturbances now, shape (d,); outputs show them at once, and inputs u later.
+        """
+        estimator, last, v_last = self.estimator, state.estimate, state.measured_disturbance
+        known = last.output_disturbance
+        updated = estimator.update(last, u, y, v_last, v)
+        if updated is not None:
+            judged, sensors = self._sensors.update(
+                state.sensors, y, updated.innovation, updated.movement, known
+            )
+            if not judged.faults:  # the everyday case
+                return updated.estimate, judged, sensors
+        estimate = estimator.predict(last, u, v_last)
+        if not all(map(is_usable, (estimate.x, estimate.output_disturbance, estimate.input_disturbance))):
+            # It ran away without measurements: start again.
+            last = estimate = estimator.initial(u, None, v_last)
+        innovation = estimator.innovation(estimate, u, y, v)
+        movement = estimator.model.C @ (estimate.x - last.x)
+        judged, sensors = self._sensors.update(state.sensors, y, innovation, movement, known)
+        if judged.newly_stuck.any():
+            disturbance = np.where(judged.newly_stuck, sensors.disturbance, estimate.output_disturbance)
+            estimate = replace(estimate, output_disturbance=disturbance)
+        if judged.believed.any():
+            estimate = estimator.corrected(estimate, innovation, judged.believed)
+        return estimate, judged, sensors
 
 
 def _where_usable(told: Array, otherwise: Array) -> Array:

@@ -159,6 +159,8 @@ class Sensors:
         self._stuck_movement = np.minimum(THRESHOLDS.stuck_movement * self._jump, LARGEST / 2)
         self._quiet_movement = THRESHOLDS.quiet_movement * self._stuck_movement
         self._coarse_step = THRESHOLDS.coarse_step * self._jump
+        self._coarse = self._coarse_step.tolist()
+        self._bounds = np.stack([self._jump, self._low, self._high], axis=1).tolist()
         self._confirm = checks.confirm
         self._stuck_after = np.inf if checks.stuck_after is None else checks.stuck_after
         self._names = problem.model.names.outputs
@@ -181,10 +183,13 @@ class Sensors:
             movement: how far the model moved the outputs since the last sample, shape (l,).
             disturbance: estimated at the outputs before this sample, shape (l,).
         """
-        fine = (np.abs(innovation) <= self._jump) & (y != state.y) & (y >= self._low) & (y <= self._high)
-        if fine.all():  # the everyday case, at once
-            zeros, step, longest = self._zeros, self._step(state, y, fine), self._longest(state, fine)
-            return self._fine, SensorState(y.copy(), *(zeros,) * 4, disturbance, longest, step)
+        if self._is_fine(state, y, innovation):  # the everyday case, at once
+            zeros, step, longest = (
+                self._zeros,
+                self._step(state, y, self._all),
+                self._longest(state, self._all),
+            )
+            return self._fine, SensorState(y.copy(), zeros, zeros, zeros, zeros, disturbance, longest, step)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))
         came = ~(missing | out)
@@ -215,6 +220,13 @@ class Sensors:
         faults = {self._names[i]: fault for fault, affected in found for i in np.flatnonzero(affected)}
         return Judged(believed, faults, stuck & (state.stuck == 0.0)), after
 
+    def _is_fine(self, state: SensorState, y: Array, innovation: Array) -> bool:
+        """Whether every number is new, in range and near its prediction; in plain floats, which few are quicker in."""
+        pairs = zip(y.tolist(), state.y.tolist(), innovation.tolist(), self._bounds, strict=True)
+        return all(
+            now != last and -jump <= e <= jump and a <= now <= b for now, last, e, (jump, a, b) in pairs
+        )
+
     def _is_stuck(self, state: SensorState, repeats: Array, moved: Array) -> BoolArray:
         """The outputs that have shown the same for too long, though the model moved them, shape (l,)."""
         coarse = state.step > self._coarse_step
@@ -232,7 +244,7 @@ class Sensors:
 
     def _longest(self, state: SensorState, changed: BoolArray) -> Array:
         """The longest run of equal numbers of a sensor that was not stuck, shape (l,)."""
-        if not state.repeats.any():
+        if state.repeats is self._zeros or not state.repeats.any():
             return state.longest
         healthy = changed & (np.abs(state.moved) > self._quiet_movement) & (state.stuck == 0.0)
         longest: Array = np.where(healthy, np.maximum(state.longest, state.repeats), state.longest)
@@ -241,7 +253,7 @@ class Sensors:
     def _step(self, state: SensorState, y: Array, changed: BoolArray) -> Array:
         """The greatest common divisor of all changes so far, shape (l,), found step by step."""
         step = state.step
-        if not ((step > self._coarse_step) | (step == 0.0)).any():
+        if all(0.0 < size <= coarse for size, coarse in zip(step.tolist(), self._coarse, strict=True)):
             return step
         change, known = np.where(changed, np.abs(y - state.y), 0.0), np.where(step > 0.0, step, 1.0)
         rest = np.fmod(change, known)
