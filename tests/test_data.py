@@ -106,9 +106,12 @@ def test_spaces_blank_lines_and_a_byte_order_mark_do_not_matter(tmp_path):
     assert np.array_equal(data.y, [[2], [4]])
 
 
-def test_a_given_step_needs_no_time_column_and_wins_over_one(tmp_path):
-    path = csv_file(tmp_path, "time,u,y\n0,1,2\n5,3,4\n6,5,6\n")
+def test_a_given_step_needs_no_time_column_and_contradicts_none(tmp_path):
+    path = csv_file(tmp_path, "u,y\n1,2\n3,4\n5,6\n")
     assert IOData.from_csv(path, inputs=["u"], outputs=["y"], dt=2.0).dt == 2.0
+    path = csv_file(tmp_path, "time,u,y\n0,1,2\n5,3,4\n10,5,6\n")
+    with pytest.raises(MampcError, match="dt: expected 5 s, the step of column 'time', received 2 s"):
+        IOData.from_csv(path, inputs=["u"], outputs=["y"], dt=2.0)
 
 
 @pytest.mark.parametrize(
@@ -121,33 +124,26 @@ def test_a_given_step_needs_no_time_column_and_wins_over_one(tmp_path):
         ("time,u,y\n0,1,2\n\n1,2,3,4\n", "expected 3 fields in row 4, received 4"),
         ("time,u,z\n0,1,2\n", r"expected one column 'y', received columns \['time', 'u', 'z'\]"),
         ("time,u,y,u\n0,1,2,3\n", "expected one column 'u', received columns"),
-        ("u,y\n1,2\n3,4\n", "expected one column 'time', .* pass dt"),
-        ("time,u,y\n0,1,2\n1,two,3\n", "expected a number in row 3, column 'u', received 'two'"),
-        (
-            "time,u,y\n0,1,2\n\n\n1,2,\n",
-            "expected a number in row 5, column 'y', received nothing; fill the gap",
-        ),
-        ("time,u,y\n0,1,nan\n1,2,3\n", "expected a number in row 2, column 'y', received 'nan'"),
-        ("time,u,y\n0,1,2\n1,inf,3\n", "expected a number in row 3, column 'u', received 'inf'"),
+        ("u,y\n1,2\n3,4\n", "expected a column of times; .* pass the sample time"),
+        ("time,u,y\n0,1,2\n1,two,3\n", "expected consecutive rows with numbers, received none"),
+        ("time,u,y\n0,1,2\n1,2 m,3\n", "expected a number in row 3, column 'u', received '2 m'"),
+        ("time,u,y\n0,1,2\n\n\n1,2,\n", "expected consecutive rows with numbers, received none"),
         ("time,u,y\n0,1,2\n1,2,3\n3,4,5\n", "expected an evenly increasing time column"),
         ("time,u,y\n0,1,2\n0,2,3\n", "expected an evenly increasing time column"),
-        ("time,u,y\n2,1,2\n1,2,3\n", "expected an evenly increasing time column"),
         ("time,u,y\n0,1,2\n", "expected an evenly increasing time column"),
-        ("noon,u,y\n0,1,2\n", "expected one column 'time'"),
-        ("time;u;y\n0;1;2\n1;2;3\n", "expected fields separated by commas, received semicolons"),
-        ("time;u;y\n0,0;1,5;2,5\n", "commas between fields and points in numbers"),
-        ("time\tu\ty\n0\t1\t2\n", "expected fields separated by commas, received tabs"),
+        ("noon,u,y\n0,1,2\n", "expected a column of times"),
+        ("time,u,y\n0,1,5,2,5\n1,2,5,3,5\n", "commas may both separate fields and mark decimals"),
     ],
 )
 def test_a_file_that_is_no_record_is_refused_with_the_place(tmp_path, text, message):
-    with pytest.raises(MampcError, match=rf"record\.csv: .*{message}"):
+    with pytest.raises(MampcError, match=rf"(?s)record\.csv: .*{message}"):
         IOData.from_csv(csv_file(tmp_path, text), inputs=["u"], outputs=["y"])
 
 
 def test_missing_files_directories_and_other_formats_are_refused(tmp_path):
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
     for name in ("missing.csv", "picture.png", ""):
-        with pytest.raises(MampcError, match="expected a readable CSV file"):
+        with pytest.raises(MampcError, match="expected a readable CSV, Excel or Parquet file"):
             IOData.from_csv(tmp_path / name, inputs=["u"], outputs=["y"])
 
 

@@ -9,7 +9,7 @@ from mampc.base.names import Names
 from mampc.base.words import Fault, Remark, Status
 from mampc.controllers import MAMPC, MPC, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
-from mampc.identification import Identified, IOData, Validation, excite, n4sid, validate
+from mampc.identification import Export, Identified, IOData, Validation, excite, n4sid, read_export, validate
 from mampc.loop.estimation import KalmanFilter
 from mampc.loop.metrics import Metrics
 from mampc.loop.regulator import Regulator
@@ -47,6 +47,7 @@ __all__ = [
     "Decision",
     "Difference",
     "Exact",
+    "Export",
     "Fault",
     "Greedy",
     "HardThresholding",
@@ -77,6 +78,7 @@ __all__ = [
     "n4sid",
     "plants",
     "prbs",
+    "read_export",
     "replay",
     "simulate",
     "steps",

@@ -1,7 +1,8 @@
 """From an input-output record to a validated model."""
 
 from mampc.identification.data import IOData, excite
+from mampc.identification.export import Export, read_export
 from mampc.identification.n4sid import Identified, n4sid
 from mampc.identification.validation import Validation, validate
 
-__all__ = ["IOData", "Identified", "Validation", "excite", "n4sid", "validate"]
+__all__ = ["Export", "IOData", "Identified", "Validation", "excite", "n4sid", "read_export", "validate"]

@@ -6,17 +6,19 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
 from mampc.base.checks import Array, as_array, as_matrix, as_number, as_vector, as_whole
-from mampc.base.csv_table import CSVTable
 from mampc.base.errors import MampcError
 from mampc.base.files import written_whole
 from mampc.base.names import Names, require_count
 from mampc.plants import Plant, advance
 from mampc.systems.state_space import StateSpace
+
+if TYPE_CHECKING:
+    from mampc.identification.export.reading import ReadingOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,33 +94,44 @@ class IOData:
         outputs: Sequence[str],
         disturbances: Sequence[str] = (),
         dt: float | None = None,
+        **options: Unpack[ReadingOptions],
     ) -> IOData:
-        """Read the named columns of a CSV file with a header row.
+        """Read the named columns of an export without gaps: CSV in its many forms, Excel or Parquet.
+
+        See `read_export`, which takes the same arguments, returns the pieces where gaps split a record, and
+        lists what it noticed; here, a warning says where samples are not simply what stands in the rows.
 
         Args:
             path: the file.
             inputs, outputs: column names.
             disturbances: columns of inputs that are measured and not manipulated.
-            dt: sample time in seconds; default from a column named `time`.
+            dt: sample time in seconds; default from the column of times, with which it must agree.
+            options: see `ReadingOptions`; messages say which one they miss.
 
         Raises:
-            MampcError: a missing column, an empty or ragged file, a field that is not a number, or
-                an uneven `time` column where dt is taken from it.
+            MampcError: a file that cannot be read, a list of what cannot be decided with its rows, or gaps.
         """
-        table = CSVTable(path)
-        given = [
-            (group,) if isinstance(group, str) else tuple(group) for group in (inputs, outputs, disturbances)
-        ]
-        names = Names(given[0], given[1], disturbances=given[2])
-        all_inputs = names.inputs + names.disturbances
-        columns = {name: table.numbers(name) for name in (*all_inputs, *names.outputs)}
-        if dt is None:
-            dt = _even_step(path, table.numbers("time", "; pass dt (--dt)"))
-        u, y = (
-            np.array([columns[name] for name in group]).reshape(len(group), len(table)).T
-            for group in (all_inputs, names.outputs)
+        from mampc.identification.export import read_one
+
+        return read_one(
+            Path(path), inputs=inputs, outputs=outputs, disturbances=disturbances, dt=dt, **options
         )
-        return cls(u, y, dt, names)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        *,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        disturbances: Sequence[str] = (),
+        dt: float | None = None,
+        **options: Unpack[ReadingOptions],
+    ) -> IOData:
+        """Read the named columns of a pandas DataFrame, as `from_csv` does; its index may hold the times."""
+        from mampc.identification.export import read_one
+
+        return read_one(frame, inputs=inputs, outputs=outputs, disturbances=disturbances, dt=dt, **options)
 
 
 def excite(
@@ -172,17 +185,6 @@ def excite(
     return IOData(signal, y, dt, names)
 
 
-def _listed(names: Sequence[str]) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)
-
-
 def _column(name: str, value: Any) -> Array:
     array = as_array(name, value)
     return as_matrix(name, array[:, None] if array.ndim == 1 else array)
-
-
-def _even_step(path: str | Path, time: Array) -> float:
-    steps = np.diff(time)
-    if len(steps) == 0 or steps[0] <= 0 or not np.allclose(steps, np.mean(steps), rtol=1e-3):
-        raise MampcError(f"{path}: expected an evenly increasing time column, or a sample time (dt, --dt)")
-    return float(np.mean(steps))

@@ -1,0 +1,214 @@
+"""The time of every row: which column tells it, and what it says, in seconds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.base.errors import shown
+from mampc.identification.export.findings import Findings, rows_text
+from mampc.identification.export.numbers import POINT, clean, is_number, numeric_share
+from mampc.identification.export.sheet import Cells, Sheet, find_column
+from mampc.identification.export.stamps import DATE_ONLY, SECONDS, TimeReading, from_stamps, since_first
+
+NAMES = re.compile(
+    r"(time|t|timestamp|date|datetime|elapsed|seconds|zeit|zeitstempel|temps|tiempo|tempo|tijd|tid)([\W_].*)?"
+)
+STAMP = re.compile(r"[^\d]{0,5}\d+[-/.:, T]+\w+[-/.:, T]+\d+.*|\d{8}[T ]\d{4,6}.*")
+CLOCK_ONLY = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AaPp][Mm])?")
+EXACT = ("time", "timestamp")
+LATEST = 4.2e9  # seconds: larger numbers are hardly seconds
+SPREADSHEET_DAYS = (36526.0, 73051.0)  # 2000 to 2100, counted as spreadsheets do
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """When the rows were recorded.
+
+    Attributes:
+        name: of the column, or of both.
+        columns: their positions.
+        seconds: after `origin`, not-a-number where it cannot be read; shape (N,).
+        origin: the moment that counts as zero, as a pandas Timestamp; None where the column holds numbers.
+        zone: behind moments as messages show them.
+    """
+
+    name: str
+    columns: tuple[int, ...]
+    seconds: Array
+    origin: Any = None
+    zone: str = ""
+
+    def __call__(self, second: float) -> str:
+        """A moment as messages show it."""
+        if self.origin is None:
+            return f"{second:.10g} s"
+        import pandas as pd
+
+        moment = self.origin + pd.Timedelta(seconds=round(second, 6))
+        return f"{moment.isoformat(sep=' ')}{self.zone}"
+
+
+def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: Findings) -> Clock | None:
+    """Find the time column and read it; None where there is none.
+
+    Args:
+        sheet: the table.
+        taken: positions of columns that are something else.
+        how: what the user says about it.
+        findings: receives notes and doubts.
+    """
+    columns = _time_columns(sheet, taken, how, findings)
+    if not columns:
+        return None
+    name = " and ".join(sheet.header[at] for at in columns)
+    cells = sheet.column(columns[0])
+    if len(columns) == 2:
+        cells = [f"{day} {hour}".strip() for day, hour in zip(cells, sheet.column(columns[1]), strict=True)]
+    if not isinstance(cells, (list, np.ndarray)):
+        seconds, origin = since_first(cells, how, sheet, findings)
+    elif isinstance(cells, np.ndarray) or (how.time_format is None and numeric_share(cells[:200]) > 0.5):
+        seconds, origin = _from_numbers(sheet, columns[0], cells, how, findings), None
+    else:
+        seconds, origin = from_stamps(cells, how, sheet, name, findings)
+    if isinstance(cells, list) and CLOCK_ONLY.fullmatch(cells[0]) and (np.diff(seconds) < 0).any():
+        findings.doubt(
+            f"times such as {cells[0]!r} in column {name!r} have no date and run past midnight; add one"
+        )
+    unreadable = np.flatnonzero(np.isnan(seconds))
+    if len(unreadable) == len(seconds):
+        findings.doubt(
+            f"expected times in column {name!r}, received {shown(_cell(cells, 0))} in row {sheet.numbers[0]}; "
+            "pass their format (--time-format '%d/%m/%Y %H:%M'), or another column (--time)"
+        )
+        return None
+    if len(unreadable):
+        examples = shown(_cell(cells, int(unreadable[0])))
+        findings.change(
+            f"no time can be read in {rows_text(sheet.numbers[unreadable].tolist())} "
+            f"(the first says {examples}); left out"
+        )
+        if len(unreadable) > 0.1 * len(seconds):
+            findings.doubt(
+                f"expected times in column {name!r}, received others such as {examples} in {len(unreadable)} of "
+                f"{len(seconds)} rows, first in row {sheet.numbers[unreadable[0]]}; pass their format (--time-format)"
+            )
+    if origin is not None and origin.tzinfo is not None:
+        return Clock(name, columns, seconds, origin.replace(tzinfo=None), " UTC")
+    return Clock(name, columns, seconds, origin)
+
+
+def _cell(cells: Cells, at: int) -> str:
+    return str(cells[at])
+
+
+def _time_columns(
+    sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: Findings
+) -> tuple[int, ...]:
+    """The column of times, or those of dates and of times of the day."""
+    if how.time is not None:
+        at = find_column(sheet.header, how.time)
+        if at is None:
+            findings.doubt(
+                f"time: expected a column of the file, received {how.time!r}; it has {shown(list(sheet.header), 400)}"
+            )
+        return () if at is None else (at,)
+    free = [at for at in range(len(sheet.header)) if at not in taken]
+    shares = {
+        kind: [at for at in free if _share(sheet, at, test) > 0.5]
+        for kind, test in (
+            (
+                "stamps",
+                lambda cell: STAMP.fullmatch(cell) and not (CLOCK_ONLY.fullmatch(cell) or is_number(cell)),
+            ),
+            ("dates", DATE_ONLY.fullmatch),
+            ("hours", CLOCK_ONLY.fullmatch),
+        )
+    }
+    dates, hours = shares["dates"], shares["hours"]
+    stamps = [at for at in shares["stamps"] if at not in dates]
+    if not stamps and len(dates) == len(hours) == 1:
+        return (dates[0], hours[0])
+    numeric = [
+        at
+        for at in free
+        if numeric_share(_sampled(sheet, at)) > 0.5
+        and (
+            sheet.header[at].casefold() in EXACT
+            or (NAMES.fullmatch(sheet.header[at].casefold()) and _runs_on(sheet, at, 0.8))
+        )
+    ]
+    found = stamps or [*dates, *hours] or numeric
+    exact = [at for at in found if sheet.header[at].casefold() in EXACT]
+    if len(found) > 1 and len(exact) == 1:
+        findings.note(f"times taken from column {sheet.header[exact[0]]!r}; there are other columns of times")
+        return (exact[0],)
+    if len(found) > 1:
+        listed = ", ".join(repr(sheet.header[at]) for at in found)
+        findings.doubt(
+            f"expected one column of times, received {listed}; say which one counts (time, --time)"
+        )
+    if not found and free[:1] == [0] and _runs_on(sheet, 0, 0.9, evenly=True):
+        return (0,)
+    return tuple(found[:1])
+
+
+def _sampled(sheet: Sheet, at: int) -> list[str]:
+    return [row[at] for row in sheet.sample]
+
+
+def _share(sheet: Sheet, at: int, test: Callable[[str], Any]) -> float:
+    cells = [clean(cell) for cell in _sampled(sheet, at) if cell]
+    return sum(bool(test(cell)) for cell in cells) / len(cells) if cells else 0.0
+
+
+def _runs_on(sheet: Sheet, at: int, share: float, *, evenly: bool = False) -> bool:
+    """Whether most numbers of a sample are larger than the one before, or smaller; evenly, and no count of rows."""
+    cells = [clean(cell).replace(",", ".") for cell in _sampled(sheet, at)]
+    steps = np.diff([float(cell) for cell in cells if numeric_share([cell]) == 1])
+    if not len(steps):
+        return False
+    usual = float(np.median(steps))
+    if not evenly:
+        return usual != 0 and bool(np.mean(steps * usual > 0) >= share)
+    return usual not in (0.0, 1.0) and bool(np.mean(np.abs(steps - usual) <= 0.3 * abs(usual)) > share)
+
+
+def _from_numbers(sheet: Sheet, at: int, cells: Cells, how: TimeReading, findings: Findings) -> Array:
+    name = sheet.header[at]
+    values = np.array(
+        [float(word) if POINT.fullmatch(word := clean(cell).replace(",", ".")) else np.nan for cell in cells]
+        if isinstance(cells, list)
+        else cells,
+        dtype=np.float64,
+    )
+    found = re.search(r"_(ms|s|sec|min|h)$", name.casefold())
+    unit = how.time_unit or sheet.units.get(at, "").casefold() or (found.group(1) if found else "")
+    if unit in SECONDS:
+        if unit not in ("s", "sec", "second", "seconds"):
+            findings.note(f"times in column {name!r} are in {unit}")
+        return values * SECONDS[unit]
+    known = values[~np.isnan(values)]
+    least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    usual = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
+    if most > LATEST * 1e2 and most < LATEST * 1e4:
+        findings.note(f"times in column {name!r} are taken as milliseconds since 1970")
+        return values / 1e3
+    if most > LATEST:
+        findings.doubt(
+            f"times in column {name!r} are numbers as large as {most:.10g}; pass their unit (--time-unit) or their "
+            "format (--time-format '%Y%m%d%H%M%S')"
+        )
+    elif SPREADSHEET_DAYS[0] < least and most < SPREADSHEET_DAYS[1] and 0 < usual < 0.01:
+        findings.doubt(
+            f"times in column {name!r} are numbers from {least:.10g} to {most:.10g}, seconds or days of a spreadsheet; "
+            "pass their unit (--time-unit s, --time-unit d)"
+        )
+    else:
+        findings.note(f"times in column {name!r} are numbers, taken as seconds")
+    return values

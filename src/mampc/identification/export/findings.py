@@ -1,0 +1,69 @@
+"""What reading an export noticed, what it did, and what only its owner can decide."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from mampc.base.errors import MampcError
+
+MOST_SHOWN = 5  # rows or values in one sentence
+MOST_DOUBTS = 25  # in one refusal
+
+
+class Findings:
+    """Sentences: notes are told, doubts are a reason to refuse the file, all at once.
+
+    Args:
+        origin: the file, as messages name it.
+    """
+
+    def __init__(self, origin: str) -> None:
+        self.origin = origin
+        self.notes: list[str] = []
+        self.changes: list[str] = []
+        self.doubts: list[str] = []
+
+    def note(self, sentence: str) -> None:
+        """How the file was understood."""
+        self.notes.append(sentence)
+
+    def change(self, sentence: str) -> None:
+        """A note that the record is not simply what stands in the rows."""
+        self.notes.append(sentence)
+        self.changes.append(sentence)
+
+    def doubt(self, sentence: str) -> None:
+        """Something that cannot be decided here."""
+        if sentence not in self.doubts:
+            self.doubts.append(sentence)
+
+    def require_none(self) -> None:
+        """Raise one `MampcError` with every doubt, if there is any."""
+        if not self.doubts:
+            return
+        if len(self.doubts) == 1:
+            raise MampcError(f"{self.origin}: {self.doubts[0]}")
+        more = len(self.doubts) - MOST_DOUBTS
+        lines = [f"  - {doubt}" for doubt in self.doubts[:MOST_DOUBTS]]
+        lines += [f"  - and {more} more like these"] if more > 0 else []
+        raise MampcError("\n".join([f"{self.origin}: {len(self.doubts)} things to decide first", *lines]))
+
+
+def counted(count: int, noun: str) -> str:
+    """ "1 row" or "7 rows"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def rows_text(numbers: Iterable[int], count: int | None = None) -> str:
+    """ "row 3", "rows 3, 9 and 12" or "rows 3, 9, 12, 14, 15 and 30 more"."""
+    first = []
+    for number in numbers:
+        first.append(str(number))
+        if len(first) == MOST_SHOWN + 1:
+            break
+    total = len(list(numbers)) if count is None and hasattr(numbers, "__len__") else count or len(first)
+    if total == 1:
+        return f"row {first[0]}"
+    if total > MOST_SHOWN:
+        return f"rows {', '.join(first[:MOST_SHOWN])} and {total - MOST_SHOWN} more"
+    return f"rows {', '.join(first[:-1])} and {first[-1]}"

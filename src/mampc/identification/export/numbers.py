@@ -1,0 +1,276 @@
+"""Cells as numbers, and which of them are marks for a value that is not there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from mampc.base.checks import LARGEST, Array, as_number
+from mampc.base.errors import MampcError, shown
+from mampc.identification.export.findings import Findings, rows_text
+from mampc.identification.export.sheet import Cells, Sheet
+
+PLAIN_CHARACTERS = frozenset("0123456789+-.eE \n")
+POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+GROUPED = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", re.ASCII)  # 1,234 or 1,234,567.8
+GROUPED_FOR_SURE = re.compile(r"[+-]?\d{1,3}((,\d{3})+\.\d*|(,\d{3}){2,})", re.ASCII)
+EITHER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # 1,234: grouped thousands, or three decimals
+DIGIT = re.compile(r"\d")
+# Words that programs write in the place of a value with digits in them; a word without digits never is a number.
+MARK = re.compile(
+    r"#|\b(bad|no ?data|no ?good|err(or)?|fail(ed|ure)?|invalid|time ?out|null|nan)\b", re.IGNORECASE
+)
+# Numbers that programs write in the place of a value: they count as marks only far from all other values.
+MARKS = [
+    *(sign * float(nines) for nines in ("999", "9999", "99999", "999999", "9999999") for sign in (1, -1)),
+    999.25, -999.25, 32767.0, -32768.0, 65535.0, -32767.0, 2147483647.0, -2147483648.0, 4294967295.0,
+]  # fmt: skip
+SWAPPED = str.maketrans(",.", ".,")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How cells become numbers, where that is not plain.
+
+    Args:
+        decimal: "." or ","; None to see it from the cells.
+        bad: words and numbers that mark a value as missing, beside the usual ones.
+        ranges: lowest and highest believable value of columns.
+    """
+
+    decimal: str | None = None
+    bad: tuple[str, ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.decimal not in (None, ".", ","):
+            raise MampcError(f"decimal: expected '.' or ',', received {shown(self.decimal)}")
+        bad = (self.bad,) if isinstance(self.bad, (str, int, float)) else tuple(self.bad)
+        object.__setattr__(self, "bad", tuple(str(word).strip().casefold() for word in bad))
+        for name, limits in self.ranges.items():
+            if not isinstance(limits, Sequence) or len(limits) != 2:
+                raise MampcError(
+                    f"ranges[{name!r}]: expected a lowest and a highest value, received {shown(limits)}"
+                )
+            low, high = (as_number(f"ranges[{name!r}]", limit) for limit in limits)
+            if low >= high:
+                raise MampcError(
+                    f"ranges[{name!r}]: expected the lowest value first, received {shown(limits)}"
+                )
+
+
+@dataclass
+class Column:
+    """One column as numbers, not-a-number where there is none.
+
+    Attributes:
+        name: as it stands in the header.
+        values: shape (N,).
+        marks: what stood in the place of numbers: how often, and the first row.
+    """
+
+    name: str
+    values: Array
+    marks: dict[str, list[int]] = field(default_factory=dict)
+
+    def mark(self, what: str, row: int) -> None:
+        """Count one cell without a number."""
+        self.marks.setdefault(what, [0, row])[0] += 1
+
+    def __str__(self) -> str:
+        """'TI101: no number in 12 rows: "Bad" (8, first in row 57), ...'."""
+        total = sum(count for count, _ in self.marks.values())
+        kinds = sorted(self.marks.items(), key=lambda item: -item[1][0])
+        words = [f"{what} ({count}, first in row {row})" for what, (count, row) in kinds[:6]]
+        if len(kinds) > 6:
+            words.append(f"{len(kinds) - 6} other kinds")
+        return f"{self.name}: no number in {total} of {len(self.values)} rows: {', '.join(words)}"
+
+
+def read_numbers(
+    sheet: Sheet, columns: Mapping[str, int], reading: Reading, findings: Findings
+) -> list[Column]:
+    """The columns, by name and position, as numbers; cells that may or may not be numbers become doubts."""
+    doubts = len(findings.doubts)
+    decimal = reading.decimal or _decimal_mark(sheet, list(columns.values()), findings)
+    grouped = reading.decimal is not None or len(findings.doubts) > doubts
+    readers = [_Reader(name, len(sheet), decimal, grouped, reading) for name in columns]
+    start = 0
+    for part in sheet.chunks(list(columns.values())):
+        rows = sheet.numbers[start : start + len(part[0])]
+        for reader, cells in zip(readers, part, strict=True):
+            reader.read(start, cells, rows)
+        start += len(rows)
+    return [reader.finish(sheet.numbers, findings) for reader in readers]
+
+
+def clean(cell: str) -> str:
+    """A cell without spaces around it and with a plain minus sign."""
+    return cell.strip().replace("−", "-")
+
+
+class _Reader:
+    """Reads one column chunk by chunk."""
+
+    def __init__(self, name: str, size: int, decimal: str, grouped: bool, reading: Reading) -> None:
+        self.column = Column(name, np.full(size, np.nan))
+        self.reading = reading
+        self.decimal = decimal
+        self.unclear: dict[str, list[int]] = {}
+        self.either: list[tuple[int, str]] = []  # positions and cells such as 1,234
+        self.grouped = grouped  # whether thousands are known to stand in groups
+
+    def read(self, start: int, cells: Cells, rows: npt.NDArray[np.int64]) -> None:
+        values = self.column.values[start : start + len(cells)]
+        if not isinstance(cells, list):
+            values[:] = cells
+            for i in np.flatnonzero(np.isnan(values)).tolist():
+                self.column.mark("nothing", int(rows[i]))
+        else:
+            text = "\n".join(cells)
+            if self.decimal == ",":
+                text = text.translate(SWAPPED)
+            plain = None
+            if PLAIN_CHARACTERS.issuperset(text):
+                try:
+                    plain = [float(word) for word in text.split("\n")]
+                except ValueError:
+                    plain = None
+            if plain is not None:
+                values[:] = plain
+            else:
+                for i, cell in enumerate(cells):
+                    values[i] = self._number(start + i, clean(cell), int(rows[i]))
+        self._drop_beyond_reason(values, rows)
+
+    def finish(self, rows: npt.NDArray[np.int64], findings: Findings) -> Column:
+        column = self.column
+        if self.either and self.grouped:
+            for at, cell in self.either:
+                column.values[at] = float(cell.replace(",", ""))
+        elif self.either:
+            at, cell = self.either[0]
+            cell = cell.translate(SWAPPED) if self.decimal == "," else cell
+            findings.doubt(
+                f"{column.name}: {cell!r} in row {rows[at]} and {len(self.either) - 1} more like it may have "
+                "grouped thousands or another decimal mark; pass decimal (--decimal)"
+            )
+        for what, places in list(self.unclear.items())[:3]:
+            findings.doubt(
+                f"expected a number in {rows_text(places)}, column {column.name!r}, received {shown(what)}; "
+                "if it marks a missing value, name it in bad (--bad)"
+            )
+        if len(self.unclear) > 3:
+            findings.doubt(f"{column.name}: {len(self.unclear) - 3} other cells that are no numbers")
+        self._drop_marked_numbers(rows, findings)
+        self._drop_out_of_range(rows)
+        if not self.unclear and not self.either and np.isnan(column.values).all():
+            found = ", ".join(list(column.marks)[:5])
+            findings.doubt(f"expected numbers in column {column.name!r}, received only {found}")
+        return column
+
+    def _number(self, at: int, cell: str, row: int) -> float:
+        """The number in a cell, or not-a-number and a remark why."""
+        if cell.casefold() in self.reading.bad:
+            self.column.mark(shown(cell), row)
+            return np.nan
+        word = cell.translate(SWAPPED) if self.decimal == "," else cell
+        if POINT.fullmatch(word):
+            return float(word)
+        if GROUPED.fullmatch(word):
+            self.grouped = self.grouped or GROUPED_FOR_SURE.fullmatch(word) is not None
+            self.either.append((at, word))
+        elif cell == "":
+            self.column.mark("nothing", row)
+        elif not DIGIT.search(cell) or MARK.search(cell):
+            self.column.mark(shown(cell), row)
+        else:
+            self.unclear.setdefault(cell, []).append(row)
+        return np.nan
+
+    def _drop_beyond_reason(self, values: Array, rows: npt.NDArray[np.int64]) -> None:
+        for i in np.flatnonzero(np.abs(values) >= LARGEST):
+            self.column.mark("infinite" if np.isinf(values[i]) else f"{values[i]:g}", int(rows[i]))
+            values[i] = np.nan
+
+    def _drop_marked_numbers(self, rows: npt.NDArray[np.int64], findings: Findings) -> None:
+        values, name = self.column.values, self.column.name
+        named = [float(word) for word in self.reading.bad if POINT.fullmatch(word)]
+        self._drop(np.isin(values, named), rows)
+        low, high = self.reading.ranges.get(name, (np.inf, -np.inf))
+        suspects = [mark for mark in MARKS if not low <= mark <= high]
+        suspect = np.isin(values, suspects)
+        others = values[~suspect & ~np.isnan(values)]
+        if not suspect.any() or not others.size:
+            return
+        least, most = float(others.min()), float(others.max())
+        for mark in np.unique(values[suspect]):
+            distance = max(least - mark, mark - most)
+            if distance > most - least:
+                self._drop(values == mark, rows)
+            elif distance > 0:
+                findings.doubt(
+                    f"{name}: {mark:g} in {rows_text(rows[values == mark].tolist())} may be a value or a mark for a "
+                    "missing one; name it in bad (--bad), or state a range that holds it (--range)"
+                )
+
+    def _drop_out_of_range(self, rows: npt.NDArray[np.int64]) -> None:
+        low, high = self.reading.ranges.get(self.column.name, (-np.inf, np.inf))
+        values = self.column.values
+        self._drop((values < low) | (values > high), rows, f"outside {low:g} to {high:g}")
+
+    def _drop(
+        self, where: npt.NDArray[np.bool_], rows: npt.NDArray[np.int64], why: str | None = None
+    ) -> None:
+        for i in np.flatnonzero(where):
+            self.column.mark(why or f"{self.column.values[i]:g}", int(rows[i]))
+        self.column.values[where] = np.nan
+
+
+def _decimal_mark(sheet: Sheet, columns: Sequence[int], findings: Findings) -> str:
+    """The decimal mark, from the first cells that leave no choice."""
+    either = None
+    for part in sheet.chunks(columns):
+        for cells in part:
+            for cell in cells if isinstance(cells, list) else ():
+                if "," not in cell and "." not in cell:
+                    continue
+                word = clean(cell)
+                if EITHER.fullmatch(word):
+                    either = either or word
+                    continue
+                point, comma = _has_point(word), _has_point(word.translate(SWAPPED))
+                if point != comma:
+                    return "." if point else ","
+    if either is None:
+        return "."
+    if sheet.separator == ";" and "," in either:
+        findings.note(
+            f"numbers such as {either} are read with a decimal comma, as fields are separated by semicolons"
+        )
+        return ","
+    if "," in either:
+        findings.doubt(
+            f"numbers such as {either!r} may have a decimal comma or grouped thousands; pass decimal (--decimal)"
+        )
+    return "."
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell may be a number, with either decimal mark."""
+    return _has_point(cell) or _has_point(cell.translate(SWAPPED)) or EITHER.fullmatch(cell) is not None
+
+
+def _has_point(word: str) -> bool:
+    return POINT.fullmatch(word) is not None or GROUPED_FOR_SURE.fullmatch(word) is not None
+
+
+def numeric_share(cells: Iterable[str]) -> float:
+    """The share of numbers among the cells that hold anything, with either decimal mark; 0 where there is none."""
+    filled = [clean(cell) for cell in cells if cell]
+    numbers = sum(POINT.fullmatch(cell.replace(",", ".")) is not None for cell in filled)
+    return numbers / len(filled) if filled else 0.0

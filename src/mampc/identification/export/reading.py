@@ -1,0 +1,181 @@
+"""An export becomes records: the pieces without a gap, and a list of all that was noticed and done."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import numpy as np
+
+from mampc.base.checks import as_number
+from mampc.base.errors import MampcError, shown
+from mampc.base.names import Names
+from mampc.identification.data import IOData
+from mampc.identification.export.clock import read_clock
+from mampc.identification.export.findings import Findings, counted
+from mampc.identification.export.grid import STRAYING, make_grid, pieces, resampled
+from mampc.identification.export.numbers import Reading, read_numbers
+from mampc.identification.export.quality import drop_bad_quality, quality_columns
+from mampc.identification.export.sheet import find_column, open_sheet
+from mampc.identification.export.stamps import TimeReading
+
+
+class ReadingOptions(TypedDict, total=False):
+    """How an export is read, where that is not plain from the file; messages say which one they miss.
+
+    time: column of times; default found.
+    time_unit: of times that are numbers: "ms", "s", "min", "h" or "d".
+    time_format: of time stamps, as in `strptime`.
+    time_zone: of local time stamps, such as "Europe/Berlin".
+    decimal: "." or ",".
+    bad: further words and numbers that stand in the place of a missing value.
+    good: words of quality columns that mean a good value.
+    ranges: lowest and highest believable value of columns, {"TI101": (0.0, 200.0)}.
+    """
+
+    time: str | None
+    time_unit: str | None
+    time_format: str | None
+    time_zone: str | None
+    decimal: str | None
+    bad: Sequence[str]
+    good: Sequence[str]
+    ranges: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Export:
+    """What an export holds.
+
+    Attributes:
+        records: one for each piece without a gap, in the order of time.
+        notes: all that was noticed and done, a sentence each.
+        changes: those of them after which the records are not simply what stands in the rows.
+        starts: when each record begins, as text.
+    """
+
+    records: tuple[IOData, ...]
+    notes: tuple[str, ...]
+    changes: tuple[str, ...]
+    starts: tuple[str, ...]
+
+
+def read_export(
+    source: Any,
+    *,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    disturbances: Sequence[str] = (),
+    dt: float | None = None,
+    **options: Unpack[ReadingOptions],
+) -> Export:
+    """Read the named columns of an export: CSV in its many forms, Excel, Parquet, or a pandas DataFrame.
+
+    No number is made of a mark for a missing or bad value, no gap is closed, and no sample time is changed: rows
+    without a complete set of values are left out, and gaps split the record.
+
+    Args:
+        source: path of a file, or a DataFrame.
+        inputs, outputs: column names, with or without the unit behind them.
+        disturbances: columns of inputs that are measured and not manipulated.
+        dt: sample time in seconds; default from the column of times, with which it must agree.
+        options: see `ReadingOptions`.
+
+    Raises:
+        MampcError: a file that cannot be read, or a list of what cannot be decided, with the rows.
+    """
+    origin = str(source) if isinstance(source, (str, Path)) else "DataFrame"
+    findings = Findings(origin)
+    names = Names(_listed(inputs), _listed(outputs), disturbances=_listed(disturbances))
+    wanted = (*names.inputs, *names.disturbances, *names.outputs)
+    if not names.inputs + names.disturbances or not names.outputs:
+        raise MampcError(
+            f"{origin}: expected at least one input and output, received {len(wanted) - len(names.outputs)} and "
+            f"{len(names.outputs)}"
+        )
+    if dt is not None:
+        dt = as_number("dt", dt, 0.0, exclusive=True)
+    how = TimeReading(*(options.get(key) for key in ("time", "time_unit", "time_format", "time_zone")))  # type: ignore[arg-type]
+    reading = Reading(
+        options.get("decimal"), tuple(_listed(options.get("bad", ()))), options.get("ranges", {})
+    )
+    unknown = [name for name in reading.ranges if name not in wanted]
+    if unknown:
+        raise MampcError(f"ranges: expected names among {wanted}, received {shown(unknown[0])}")
+
+    sheet = open_sheet(source, wanted, findings)
+    positions = {name: _position(sheet.header, name) for name in wanted}
+    quality = tuple(quality_columns(sheet.header, positions))
+    clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
+    columns = read_numbers(sheet, positions, reading, findings)
+    drop_bad_quality(sheet, columns, positions, _listed(options.get("good", ())), findings)
+    for column in columns:
+        if column.marks:
+            findings.change(str(column))
+    values = np.column_stack([column.values for column in columns])
+    grid = make_grid(clock, values, sheet.numbers, dt, findings)
+    findings.require_none()
+    assert grid is not None  # else there is a doubt
+    values = values[grid.order]
+    usable = np.asarray(np.isfinite(values).all(axis=1))
+    if not usable.any():
+        raise MampcError(f"{origin}: expected rows with a number in every column, received none")
+    m = len(names.inputs)
+    records, starts, strays, short = [], [], 0.0, 0
+    for piece in pieces(grid, clock, usable, sheet.numbers, findings):
+        seconds = grid.seconds[piece]
+        held, changing, straying = resampled(seconds, values[piece, :m], values[piece, m:], grid.dt)
+        d = len(names.disturbances)
+        if len(held) < 2 <= len(usable):
+            short += 1
+            continue
+        strays = max(strays, straying)
+        records.append(IOData(np.hstack([held, changing[:, :d]]), changing[:, d:], grid.dt, names))
+        starts.append(clock(float(seconds[0])) if clock else f"row {sheet.numbers[grid.order[piece[0]]]}")
+    if short:
+        findings.change(f"{counted(short, 'row')} between gaps on both sides left out")
+    if not records:
+        raise MampcError(f"{origin}: expected consecutive rows with numbers, received none")
+    if strays > STRAYING:
+        findings.change(
+            f"times stray by up to {strays * grid.dt:.3g} s from even steps of {grid.dt:.8g} s: resampled, outputs on "
+            "straight lines between rows, inputs from the nearest row"
+        )
+    elif strays > 1e-6:
+        findings.note(
+            f"times stray by up to {strays * grid.dt:.2g} s from even steps of {grid.dt:.8g} s; taken as even"
+        )
+    return Export(tuple(records), tuple(findings.notes), tuple(findings.changes), tuple(starts))
+
+
+def read_one(source: Any, **options: Any) -> IOData:
+    """The one record of an export; warns of what was changed.
+
+    Raises:
+        MampcError: as `read_export`, or gaps that split the record in several.
+    """
+    export = read_export(source, **options)
+    if len(export.records) > 1:
+        lengths = ", ".join(str(len(record)) for record in export.records[:8])
+        gaps = "; ".join(note for note in export.notes if "in the record, which is split there" in note)
+        origin = str(source) if isinstance(source, (str, Path)) else "DataFrame"
+        raise MampcError(
+            f"{origin}: expected one record, received {len(export.records)} pieces of {lengths} samples ({gaps}); "
+            "take them all with read_export(...).records"
+        )
+    if export.changes:
+        warnings.warn("\n".join(export.changes), stacklevel=3)
+    return export.records[0]
+
+
+def _position(header: Sequence[str], name: str) -> int:
+    at = find_column(header, name)
+    assert at is not None  # the sheet was opened with this name
+    return at
+
+
+def _listed(names: Any) -> tuple[Any, ...]:
+    return (names,) if isinstance(names, (str, int, float)) else tuple(names)

@@ -1,0 +1,395 @@
+"""Rows of cells under a header, whether they come from text, a spreadsheet, a Parquet file or a data frame."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError, shown
+from mampc.base.files import read_bounded
+from mampc.identification.export.findings import Findings, rows_text
+from mampc.identification.export.workbook import read_parquet, read_workbook
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FILE_LIMIT = 256 * 2**20  # bytes
+KIND = "CSV, Excel or Parquet file"
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
+HEAD = 200  # rows among which the header is looked for
+CHUNK = 20_000  # rows parsed at a time
+UNIT = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")
+BINARY = re.compile(rb"[\x00-\x08\x0e-\x19\x1c-\x1f]|\x1a(?!\s*$)")
+
+# Words as they stand, numbers, or a pandas Series of times.
+Cells: TypeAlias = "list[str] | npt.NDArray[Any] | pd.Series"
+Row: TypeAlias = tuple[int, Sequence[str]]  # its number in the file, its cells
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """Named columns of cells.
+
+    Attributes:
+        header: of every column; a name may stand there twice.
+        units: of columns, where the file has a row of units or the name ends in one, such as "level [m]".
+        numbers: of the rows in the file, for messages; shape (N,).
+        chunks: yields the cells of the columns at some positions, a list of `Cells` for consecutive rows.
+        separator: of fields, where they are text.
+    """
+
+    header: tuple[str, ...]
+    units: dict[int, str]
+    numbers: npt.NDArray[np.int64]
+    chunks: Callable[[Sequence[int]], Iterator[list[Cells]]]
+    separator: str | None = None
+    sample: list[list[str]] = field(default_factory=list)  # the first rows, as words
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def column(self, at: int) -> Cells:
+        """All cells of one column."""
+        parts = [part for [part] in self.chunks([at])]
+        if len(parts) == 1:
+            return parts[0]
+        return [cell for part in parts for cell in part]
+
+
+def find_column(header: Sequence[str], name: str) -> int | None:
+    """The position of a name in a header, exactly or without the unit behind it; None unless there is one."""
+    for known in (list(header), [UNIT.sub("", word) for word in header]):
+        if known.count(name) == 1:
+            return known.index(name)
+        if name in known:
+            return None
+    return None
+
+
+def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
+    """The table in a file, or in a pandas DataFrame.
+
+    Args:
+        source: a path, or the frame.
+        names: columns that must be there, by which the header is known; none, to take the likeliest row.
+        findings: receives notes and doubts.
+
+    Raises:
+        MampcError: no such file, or nothing in it that could be such a table.
+    """
+    if not isinstance(source, (str, Path)):
+        return frame_sheet(source, names, findings)
+    content = read_bounded(source, FILE_LIMIT, KIND)
+    if content.startswith(b"PAR1"):
+        return frame_sheet(read_parquet(source, content), names, findings)
+    if content.startswith(b"PK\x03\x04"):
+        worksheets = read_workbook(source, content)
+        return _row_sheet([(None, rows) for rows in worksheets], names, findings)
+    if content.startswith(b"\xd0\xcf\x11\xe0"):
+        raise MampcError(
+            f"{source}: expected a readable {KIND}, received an old Excel file; save it as .xlsx"
+        )
+    encoding = _encoding(source, content, findings)
+
+    def parsed(separator: str) -> Callable[[], Iterator[Row]]:
+        def rows() -> Iterator[Row]:
+            text = io.TextIOWrapper(io.BytesIO(content), encoding=encoding, newline="")
+            reader = csv.reader(text, delimiter=separator)
+            try:
+                for row in reader:
+                    yield reader.line_num, row
+            except (csv.Error, UnicodeError) as error:
+                raise MampcError(
+                    f"{source}: expected a readable {KIND}, received in row {reader.line_num}: {error}"
+                ) from None
+
+        return rows
+
+    return _row_sheet([(separator, parsed(separator)) for separator in SEPARATORS], names, findings)
+
+
+def frame_sheet(frame: Any, names: Sequence[str], findings: Findings) -> Sheet:
+    """The columns of a pandas DataFrame, and its index where that has a name or is one of times."""
+    import pandas as pd
+
+    if not isinstance(frame, pd.DataFrame):
+        raise MampcError(f"expected a pandas DataFrame, received {shown(type(frame).__name__)}")
+    if frame.columns.nlevels != 1 or frame.index.nlevels != 1:
+        raise MampcError("DataFrame: expected columns and an index of one level each")
+    if frame.index.name is not None or isinstance(frame.index, pd.DatetimeIndex):
+        index = frame.index.to_series(index=range(len(frame)))
+        frame = frame.reset_index(drop=True)
+        frame.insert(0, "index" if index.name is None else index.name, index, allow_duplicates=True)
+    if frame.empty:
+        raise MampcError(
+            f"{findings.origin}: expected a header and rows of numbers, received {len(frame)} rows"
+        )
+    header = tuple(str(name).strip() for name in frame.columns)
+    _require_columns(header, names, findings)
+
+    def chunks(columns: Sequence[int]) -> Iterator[list[Cells]]:
+        yield [_frame_cells(frame.iloc[:, at]) for at in columns]
+
+    head = frame.iloc[:50]
+    sample = [
+        list(row)
+        for row in zip(*(_words(_frame_cells(head.iloc[:, at])) for at in range(len(header))), strict=True)
+    ]
+    return Sheet(header, _header_units(header), np.arange(len(frame)), chunks, None, sample)
+
+
+def _frame_cells(column: Any) -> Cells:
+    import pandas as pd
+
+    if pd.api.types.is_bool_dtype(column.dtype):
+        return _texts(column)
+    if pd.api.types.is_numeric_dtype(column.dtype) and not pd.api.types.is_complex_dtype(column.dtype):
+        numbers: Array = column.to_numpy(dtype=np.float64, na_value=np.nan)
+        return numbers
+    if pd.api.types.is_datetime64_any_dtype(column.dtype):
+        times: Any = column.reset_index(drop=True)
+        return times
+    return _texts(column)
+
+
+def _texts(column: Any) -> list[str]:
+    return [
+        "" if missing else str(cell).strip()
+        for cell, missing in zip(column.tolist(), column.isna().tolist(), strict=True)
+    ]
+
+
+def _words(cells: Cells) -> list[str]:
+    return cells if isinstance(cells, list) else ["" if cell != cell else str(cell) for cell in cells]
+
+
+def _encoding(path: str | Path, content: bytes, findings: Findings) -> str:
+    """The encoding of a text; raises `MampcError` where it is none."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    zeros = content[:2000].count(0)
+    if (
+        zeros > len(content[:2000]) / 3
+    ):  # letters of Latin scripts in two bytes each, without a mark of their order
+        return "utf-16-be" if content[0] == 0 else "utf-16-le"
+    if BINARY.search(content[:65536]):
+        raise MampcError(f"{path}: expected a readable {KIND}, received something else")
+    try:
+        for _ in io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig"):
+            pass
+    except UnicodeDecodeError:
+        findings.note("text is not UTF-8: read as Windows-1252 (Western European)")
+        return "cp1252" if not re.search(rb"[\x81\x8d\x8f\x90\x9d]", content) else "latin-1"
+    return "utf-8-sig"
+
+
+def _row_sheet(
+    readings: Sequence[tuple[str | None, Callable[[], Iterator[Row]]]],
+    names: Sequence[str],
+    findings: Findings,
+) -> Sheet:
+    """The table in rows, read in the one of several ways that has the wanted columns."""
+    heads = []
+    for separator, rows in readings:
+        head = [(number, _stripped(row)) for number, row in islice(rows(), HEAD)]
+        head = [(number, row) for number, row in head if any(row)]
+        heads.append((separator, rows, head))
+    if not any(head for _, _, head in heads):
+        raise MampcError(
+            f"{findings.origin}: expected a header and at least one row of numbers, received 0 rows"
+        )
+    found = None
+    if names:
+        fits = [
+            (s, rows, head, at) for s, rows, head in heads if (at := _header_with(head, names)) is not None
+        ]
+        found = fits[0] if fits else None
+        if len(fits) > 1 and readings[0][0] is None:
+            findings.doubt(f"expected one worksheet with these columns, received {len(fits)} of them")
+    if found is None:
+        separator, rows, head = max(heads, key=lambda candidate: _evenness(candidate[2]))
+        found = separator, rows, head, _likeliest_header(head)
+    separator, rows, head, at = found
+    header_number, header_row = head[at]
+    header = _without_empty_end(header_row)
+    if at:
+        findings.note(
+            f"{rows_text([number for number, _ in head[:at]])} before the header left out: "
+            f"{shown(' '.join(cell for cell in head[0][1] if cell))}"
+        )
+    if names:
+        _require_columns(header, names, findings)
+    return _measured(rows, separator, header_number, header, names, findings)
+
+
+def _measured(
+    rows: Callable[[], Iterator[Row]],
+    separator: str | None,
+    header_number: int,
+    header: tuple[str, ...],
+    names: Sequence[str],
+    findings: Findings,
+) -> Sheet:
+    """Go through all rows once: which are data, which are the header's, which have cells missing or too many."""
+    width = len(header)
+    positions = [at for name in names if (at := find_column(header, name)) is not None] or list(range(width))
+    numbers: list[int] = []
+    descriptions: list[tuple[int, list[str]]] = []
+    ragged: list[tuple[int, list[str]]] = []
+    broken: list[int] = []
+    repeated: list[int] = []
+    sample: list[list[str]] = []
+    previous = header_number
+    for number, row in _from(rows, header_number):
+        tall, previous = number - previous > 1 and any("\n" in cell or "\r" in cell for cell in row), number
+        if len(row) != width:
+            cells = _stripped(row)
+            if not any(cells):
+                continue
+            if len(cells) < width or any(cells[width:]):
+                ragged.append((number, cells))
+                continue
+        if tall:
+            broken.append(number)
+        if len(sample) < 50:
+            cells = _stripped(row)
+            if not numbers and not any(_is_number_like(cells[at]) for at in positions):
+                descriptions.append((number, cells))
+                continue
+            sample.append(cells[:width])
+        if row[0] == header[0] and tuple(_stripped(row))[:width] == header:
+            repeated.append(number)
+            continue
+        numbers.append(number)
+    skipped = frozenset([*repeated, *(number for number, _ in [*descriptions, *ragged])])
+    ragged = _without_footer(ragged, numbers, findings)
+    if len(ragged) == 1:
+        findings.doubt(f"expected {width} fields in row {ragged[0][0]}, received {len(ragged[0][1])}")
+    elif ragged:
+        places = rows_text([number for number, _ in ragged])
+        findings.doubt(f"expected {width} fields in every row, received {len(ragged[0][1])} in {places}")
+    if ragged and separator == "," and all(len(cells) > width for _, cells in ragged):
+        findings.doubt(
+            "commas may both separate fields and mark decimals: save with semicolons between fields"
+        )
+    if broken:
+        findings.doubt(
+            f"expected one line a row, received a quoted field of several lines in {rows_text(broken)}"
+        )
+    if repeated:
+        findings.note(f"the header stands again in {rows_text(repeated)}; left out")
+    if not numbers and ragged:
+        findings.require_none()
+    if not numbers:
+        raise MampcError(
+            f"{findings.origin}: expected a header and at least one row of numbers, received 1 rows"
+            if not descriptions
+            else f"{findings.origin}: expected rows of numbers under the header, received "
+            f"{shown(descriptions[0][1], 200)} in row {descriptions[0][0]}"
+        )
+    units = _header_units(header)
+    if descriptions:
+        findings.note(
+            f"{rows_text([number for number, _ in descriptions])} under the header hold no numbers: "
+            f"{shown(' | '.join(descriptions[-1][1]), 100)}"
+        )
+        shortest = min(descriptions, key=lambda line: sum(map(len, line[1])))[1]
+        units = {at: unit for at, unit in enumerate(shortest[:width]) if unit and not units.get(at)} | units
+
+    def chunks(columns: Sequence[int]) -> Iterator[list[Cells]]:
+        data = (
+            row
+            for number, row in _from(rows, header_number)
+            if number not in skipped and (len(row) == width or any(_stripped(row)))
+        )
+        while part := list(islice(data, CHUNK)):
+            yield [[row[at].strip() for row in part] for at in columns]
+
+    return Sheet(header, units, np.array(numbers, dtype=np.int64), chunks, separator, sample)
+
+
+def _from(rows: Callable[[], Iterator[Row]], header_number: int) -> Iterator[Row]:
+    """The rows under the header that are not blank."""
+    return ((number, row) for number, row in rows() if row and number > header_number)
+
+
+def _without_footer(
+    ragged: list[tuple[int, list[str]]], numbers: list[int], findings: Findings
+) -> list[tuple[int, list[str]]]:
+    """Without the last rows where they hold one cell each, such as "594 rows exported"."""
+    footer = [
+        (number, cells)
+        for number, cells in ragged
+        if sum(map(bool, cells)) == 1
+        and not any(map(_is_number_like, cells))
+        and numbers
+        and number > numbers[-1]
+    ]
+    if footer:
+        last = shown(" ".join(footer[-1][1]).strip())
+        findings.note(f"{rows_text([number for number, _ in footer])} after the table left out: {last}")
+    return [line for line in ragged if line not in footer]
+
+
+def _stripped(row: Sequence[str]) -> list[str]:
+    return [cell.strip() for cell in row]
+
+
+def _without_empty_end(row: Sequence[str]) -> tuple[str, ...]:
+    width = max(i + 1 for i, cell in enumerate(row) if cell)
+    return tuple(row[:width])
+
+
+def _is_number_like(cell: str) -> bool:
+    return re.fullmatch(r"[+\-−]?[\d.,]*\d[\d.,]*([eE][+\-]?\d+)?", cell, re.ASCII) is not None
+
+
+def _header_with(head: Sequence[tuple[int, list[str]]], names: Sequence[str]) -> int | None:
+    """The first row in which all names stand."""
+    for i, (_, row) in enumerate(head):
+        plain = {UNIT.sub("", cell) for cell in row} | set(row)
+        if len(row) > 1 and all(name in plain for name in names):
+            return i
+    return None
+
+
+def _evenness(head: Sequence[tuple[int, list[str]]]) -> int:
+    """How many cells stand in rows of the most frequent width above one."""
+    widths = [len(row) for _, row in head if len(row) > 1]
+    return max((widths.count(width) * width for width in set(widths)), default=0)
+
+
+def _likeliest_header(head: Sequence[tuple[int, list[str]]]) -> int:
+    """The first row of words that is as wide as most rows, else the first row."""
+    widths = [len(_without_empty_end(row)) for _, row in head]
+    usual = max(set(widths), key=lambda width: (widths.count(width) * width, width))
+    for i, (_, row) in enumerate(head):
+        if widths[i] >= usual > 1 and not any(_is_number_like(cell) for cell in row):
+            return i
+    return 0
+
+
+def _header_units(header: Sequence[str]) -> dict[int, str]:
+    found = {at: UNIT.search(name) for at, name in enumerate(header)}
+    return {at: match.group(1) for at, match in found.items() if match}
+
+
+def _require_columns(header: Sequence[str], names: Sequence[str], findings: Findings) -> None:
+    missing = [name for name in names if find_column(header, name) is None]
+    for name in missing:
+        close = difflib.get_close_matches(name, header, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close and close[0] != name else ""
+        findings.doubt(f"expected one column {name!r}, received columns {shown(list(header), 400)}{hint}")
+    if missing:
+        findings.require_none()

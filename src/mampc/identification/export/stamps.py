@@ -1,0 +1,223 @@
+"""Time stamps as seconds, by what pandas reads: orders of day and month, offsets, zones, clocks put back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError, shown
+from mampc.identification.export.findings import Findings
+from mampc.identification.export.sheet import Cells, Sheet
+
+SECONDS = {
+    "ms": 1e-3, "msec": 1e-3, "milliseconds": 1e-3,
+    "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0,
+    "min": 60.0, "minute": 60.0, "minutes": 60.0,
+    "h": 3600.0, "hr": 3600.0, "hour": 3600.0, "hours": 3600.0,
+    "d": 86400.0, "day": 86400.0, "days": 86400.0,
+}  # fmt: skip
+DATE_ONLY = re.compile(r"\d+[-/.]\w+[-/.]\d+|\w+ \w+,? \d+")
+OFFSET = re.compile(r".*\d(Z|[+-]\d\d(:?\d\d)?)")
+TIMES = (
+    "", " %H:%M:%S", " %H:%M", " %H:%M:%S.%f", " %I:%M:%S %p", " %I:%M %p", " %I:%M:%S.%f %p", " %H.%M.%S",
+)  # fmt: skip
+DAY_FIRST = (
+    "%d.%m.%Y", "%d/%m/%Y", "%d-%m-%Y", "%d.%m.%y", "%d/%m/%y", "%d-%m-%y",
+    "%d-%b-%Y", "%d-%b-%y", "%d %b %Y", "%d %b %y", "%d/%b/%Y", "%d %B %Y",
+)  # fmt: skip
+MONTH_FIRST = (
+    "%m/%d/%Y", "%m-%d-%Y", "%m/%d/%y", "%m-%d-%y", "%b %d, %Y", "%b %d %Y", "%B %d, %Y",
+)  # fmt: skip
+YEAR_FIRST = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d")
+HOUR = 3600.0
+
+
+@dataclass(frozen=True)
+class TimeReading:
+    """How the time column is read, where that is not plain.
+
+    Args:
+        time: its name; None to find it.
+        time_unit: of numbers, "ms", "s", "min", "h" or "d"; None to see it from the header, else seconds.
+        time_format: of stamps, as in `strptime`, such as "%d/%m/%Y %H:%M"; None to see it from the cells.
+        time_zone: of stamps in local time, such as "Europe/Berlin"; None where the clock is never changed.
+    """
+
+    time: str | None = None
+    time_unit: str | None = None
+    time_format: str | None = None
+    time_zone: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.time_unit is not None and self.time_unit not in SECONDS:
+            raise MampcError(f"time_unit: expected one of ms, s, min, h, d, received {shown(self.time_unit)}")
+        if self.time_zone is not None:
+            from zoneinfo import ZoneInfo
+
+            try:
+                ZoneInfo(self.time_zone)
+            except (KeyError, ValueError, TypeError, OSError):
+                raise MampcError(
+                    f"time_zone: expected a name such as 'Europe/Berlin', received {shown(self.time_zone)}"
+                ) from None
+
+
+def from_stamps(
+    cells: Cells, how: TimeReading, sheet: Sheet, name: str, findings: Findings
+) -> tuple[Array, Any]:
+    """Seconds after the first stamp, and that stamp."""
+    words = [re.sub(r"\s+", " ", cell.strip()) for cell in cells]
+    offsets = [cell for cell in words if OFFSET.fullmatch(cell) and not DATE_ONLY.fullmatch(cell)]
+    if offsets and len(offsets) < 0.9 * sum(map(bool, words)):
+        findings.doubt(
+            f"some times in column {name!r} have an offset from UTC such as {offsets[0]!r}, others have none"
+        )
+    readings = list(_readings(words, how, bool(offsets)))
+    best = max(int(stamps.notna().sum()) for stamps in readings)
+    readings = [stamps for stamps in readings if best and stamps.notna().sum() >= 0.99 * best]
+    if not readings:
+        return np.full(len(words), np.nan), None
+    if len(readings) == 1:
+        return since_first(readings[0], how, sheet, findings)
+    found = [since_first(stamps, how, sheet, Findings(findings.origin)) for stamps in readings]
+    choice = 0
+    if not np.array_equal(found[0][0], found[1][0], equal_nan=True):
+        strays = [_unevenness(seconds) for seconds, _ in found]
+        choice = int(np.argmin(strays))
+        if max(strays) < 1.05 * min(strays) + 0.01:
+            findings.doubt(
+                f"times such as {words[0]!r} in column {name!r} may have the day or the month first; pass their format "
+                "(--time-format '%d/%m/%Y %H:%M:%S')"
+            )
+        else:
+            order = ("day", "month")[choice]
+            findings.note(f"times such as {words[0]!r} have the {order} first: only so are they even")
+    else:
+        findings.note(
+            f"times such as {words[0]!r} may have the day or the month first; the steps are the same"
+        )
+    return since_first(readings[choice], how, sheet, findings)
+
+
+def _readings(words: list[str], how: TimeReading, offsets: bool) -> Iterator[Any]:
+    """The stamps as pandas reads them, in each order of day and month that they may have."""
+    import pandas as pd
+
+    series = pd.Series(words, dtype=object)
+    if how.time_format is not None:
+        try:
+            yield pd.to_datetime(series, format=how.time_format, errors="coerce", utc=offsets)
+        except ValueError as error:
+            raise MampcError(f"time_format: expected a format as strptime has it, received {error}") from None
+        return
+    points = series.str.replace(r"(\d),(\d+)", r"\1.\2", regex=True)
+    iso = pd.to_datetime(points, format="ISO8601", errors="coerce", utc=offsets)
+    if iso.notna().mean() > 0.5:
+        yield iso
+        return
+    zone = (" %z", "%z") if offsets else ("",)
+    for family in (DAY_FIRST, MONTH_FIRST, YEAR_FIRST, ("",)):
+        formats = [
+            (day + time + end).strip() for day, time, end in product(family, TIMES, zone) if day or time
+        ]
+        yield _in_formats(points, formats, offsets)
+
+
+def _in_formats(series: Any, formats: Sequence[str], offsets: bool) -> Any:
+    """Every cell in the first of the formats that reads it."""
+    import pandas as pd
+
+    stamps = pd.to_datetime(pd.Series([None] * len(series), dtype=object), utc=offsets)
+    left = series[series != ""]
+    for _ in range(4):  # such as with and without fractions of seconds, and without a time at midnight
+        fitting = None
+        for cell in left.iloc[:20]:
+            fitting = next(
+                (
+                    form
+                    for form in formats
+                    if pd.notna(pd.to_datetime(cell, format=form, errors="coerce", utc=offsets))
+                ),
+                None,
+            )
+            if fitting:
+                break
+        if fitting is None:
+            break
+        read = pd.to_datetime(left, format=fitting, errors="coerce", utc=offsets)
+        stamps = (
+            read.reindex(series.index).combine_first(stamps)
+            if stamps.notna().any()
+            else read.reindex(series.index)
+        )
+        left = left[read.isna()]
+        if not len(left):
+            break
+    return stamps
+
+
+def since_first(stamps: Any, how: TimeReading, sheet: Sheet, findings: Findings) -> tuple[Array, Any]:
+    """Seconds after the earliest stamp, and that stamp, in UTC where it has a zone."""
+    stamps = stamps.reset_index(drop=True)
+    if how.time_zone is not None and getattr(stamps.dtype, "tz", None) is None:
+        stamps = _localised(stamps, how.time_zone, findings)
+    if not stamps.notna().any():
+        return np.full(len(stamps), np.nan), None
+    origin = stamps.min()
+    seconds = (stamps - origin).dt.total_seconds().to_numpy(dtype=np.float64)
+    if origin.tzinfo is None:
+        return _clock_put_back(seconds, origin, sheet, findings), origin
+    return seconds, origin.tz_convert("UTC")
+
+
+def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
+    """Local stamps in their zone; of a doubled hour, the order of rows tells which is which."""
+    known = stamps[stamps.notna()]
+    backwards = len(known) > 1 and known.iloc[0] > known.iloc[-1]
+    known = known.iloc[::-1] if backwards else known
+    try:
+        read = known.dt.tz_localize(zone, ambiguous="infer", nonexistent="NaT")
+    except ValueError as error:
+        findings.doubt(f"the doubled hour at the end of summer time in {zone} cannot be told apart: {error}")
+        read = known.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
+    return read.reindex(stamps.index)
+
+
+def _clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Findings) -> Array:
+    """Local time in the order of rows, with an hour added where the clock was put back an hour."""
+    known = np.flatnonzero(~np.isnan(seconds))
+    newest_first = len(known) > 1 and seconds[known[0]] > seconds[known[-1]]
+    known = known[::-1] if newest_first else known
+    steps = np.diff(seconds[known])
+    if len(steps) < 3 or not (steps > 0).any():
+        return seconds
+    usual = float(np.median(steps[steps > 0]))
+    back = np.flatnonzero((np.abs(steps - (usual - HOUR)) <= 0.3 * usual) & (steps <= 0))
+    if not 0 < len(back) <= 3 or (steps[np.setdiff1d(np.arange(len(steps)), back)] <= 0).mean() > 0.001:
+        return seconds
+    import pandas as pd
+
+    corrected = seconds.copy()
+    for i in back:
+        moment = origin + pd.Timedelta(seconds=float(seconds[known[i]]))
+        if usual >= HOUR and not (moment.dayofweek == 6 and moment.hour <= 3):
+            continue
+        corrected[known[i + 1 :]] += HOUR
+        findings.change(
+            f"the clock goes back an hour after {moment} (row {sheet.numbers[known[i + 1]]}): taken as the end of "
+            "summer time, rows kept in their order"
+        )
+    return corrected
+
+
+def _unevenness(seconds: Array) -> float:
+    """By how much the steps differ from the usual one, in all, as a multiple of it."""
+    steps = np.abs(np.diff(seconds[~np.isnan(seconds)]))
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    return float(np.abs(steps - usual).sum()) / usual if usual else 0.0
