@@ -196,12 +196,12 @@ def _from_numbers(sheet: Sheet, at: int, cells: Cells, how: TimeReading, finding
     known = values[~np.isnan(values)]
     least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     usual = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
-    if most > LATEST * 1e2 and most < LATEST * 1e4:
+    if LATEST * 1e2 < most < LATEST * 1e3:
         findings.note(f"times in column {name!r} are taken as milliseconds since 1970")
         return values / 1e3
     if most > LATEST:
         findings.doubt(
-            f"times in column {name!r} are numbers as large as {most:.10g}; pass their unit (--time-unit) or their "
+            f"times in column {name!r} are numbers as large as {most:.15g}; pass their unit (--time-unit) or their "
             "format (--time-format '%Y%m%d%H%M%S')"
         )
     elif SPREADSHEET_DAYS[0] < least and most < SPREADSHEET_DAYS[1] and 0 < usual < 0.01:

@@ -206,7 +206,7 @@ def _clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Finding
     corrected = seconds.copy()
     for i in back:
         moment = origin + pd.Timedelta(seconds=float(seconds[known[i]]))
-        if usual >= HOUR and not (moment.dayofweek == 6 and moment.hour <= 3):
+        if usual >= HOUR and not (moment.weekday() == 6 and moment.hour <= 3):
             continue
         corrected[known[i + 1 :]] += HOUR
         findings.change(
