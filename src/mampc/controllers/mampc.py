@@ -8,7 +8,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError
-from mampc.base.tolerances import ROUNDING, URGENT
+from mampc.base.tolerances import ROUNDING, SAME, URGENT
 from mampc.base.words import Remark, Status
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
@@ -17,7 +17,6 @@ from mampc.methods.registry import method_of
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.rounding import without_rounding
 from mampc.moves.rules import MoveRules
-from mampc.program.limits_now import LimitsNow
 from mampc.program.problem import TrackingProblem
 from mampc.program.sample import Sample
 
@@ -41,6 +40,8 @@ class MAMPC(Controller):
     Raises:
         MampcError: an unknown method or setting, or rules that do not fit the problem.
     """
+
+    _starts_inside = True  # a pattern says which inputs move, so none may be outside when it is chosen
 
     def __init__(
         self,
@@ -80,20 +81,8 @@ class MAMPC(Controller):
             if (size > most).any():
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
-    def _planned_from(self, state: ControllerState, present: LimitsNow | None) -> ControllerState:
-        """A pattern says which inputs move, so none may be outside its limits when it is chosen."""
-        if present is not None and not present.crossed:
-            u = state.inputs[-1]
-            if ((u >= present.planned_min[0]) & (u <= present.planned_max[0])).all():
-                return state
-            return self._brought_inside(state, present)
-        for u, (low, high) in zip(state.inputs[-1].tolist(), self._u_range, strict=True):
-            if not low <= u <= high:
-                return self._brought_inside(state, None)
-        return state
-
-    def _price(self, moves: Array) -> float:
-        return self._admissible.charge(moves != 0.0)
+    def _charge(self, moves: Array) -> float:
+        return self._admissible.charge(np.abs(moves) > SAME)
 
     def _plan(self, sample: Sample, state: ControllerState) -> Plan:
         search = self._search

@@ -25,8 +25,8 @@ HELD_BY = {
 class Plan(NamedTuple):
     """A method's answer: moves d (n_moves,) or None, how it ended, a proven bound, and its next guess.
 
-    `lower_bound` None means that the plan is proven optimal: its own objective is the bound. Inputs
-    (n_moves,) within their limits and the objective are worked out from the moves where not at hand.
+    `lower_bound` None means that the plan is proven optimal: its own objective is the bound. Inputs (n_moves,), the
+    objective and the violations of outputs (l,) are worked out from the moves where not at hand.
     """
 
     moves: Array | None
@@ -38,6 +38,7 @@ class Plan(NamedTuple):
     objective: float | None = None
     remarks: tuple[Remark, ...] = ()
     active: Array | None = None
+    violations: Array | None = None
 
 
 class Search(Protocol):

@@ -1,4 +1,4 @@
-"""Limits that hold at one sample only, told at run time: constant, or one row per sample of the horizon."""
+"""The limits of one sample: those of the problem, or others given at run time, constant or a row per sample."""
 
 from __future__ import annotations
 
@@ -14,6 +14,90 @@ from mampc.program.qp import UNBOUNDED
 from mampc.program.sample import BoundsNow, Sample
 
 
+class InputRange:
+    """Least and largest inputs at one sample, shape (m,), or (nc, m) where they vary over the horizon.
+
+    Inputs in manual may be held beyond it. Nobody plans to move them, so plans leave them where they are.
+
+    Args:
+        low, high: what inputs to apply are kept within.
+        left_alone: the inputs that plans leave beyond it, bool, shape (m,); None for none.
+    """
+
+    def __init__(self, low: Array, high: Array, left_alone: BoolArray | None = None) -> None:
+        self._low, self._high, self._left_alone = low, high, left_alone
+        if left_alone is not None:
+            low, high = np.where(left_alone, -LARGEST, low), np.where(left_alone, LARGEST, high)
+        self.low, self.high = low, high
+        self._first = low.reshape(-1, low.shape[-1])[0], high.reshape(-1, high.shape[-1])[0]
+        self._first_pairs = list(zip(self._first[0].tolist(), self._first[1].tolist(), strict=True))
+
+    def holds(self, u: Array) -> bool:
+        """Whether inputs u, shape (m,), are within the range of the first sample, those left alone aside."""
+        return all(
+            low <= value <= high for value, (low, high) in zip(u.tolist(), self._first_pairs, strict=True)
+        )
+
+    def nearest(self, u: Array) -> Array:
+        """The inputs within the range of the first sample nearest to u, shape (m,); those left alone stay."""
+        return np.asarray(np.minimum(np.maximum(u, self._first[0]), self._first[1]))
+
+    def held(self, u: Array, samples: int) -> Array:
+        """Inputs, shape (samples, m), that stay at u, shape (m,), but where the range makes them move."""
+        shape, rows = (samples, len(u)), []
+        for low, high in zip(
+            np.broadcast_to(self.low, shape), np.broadcast_to(self.high, shape), strict=True
+        ):
+            u = np.minimum(np.maximum(u, low), high)
+            rows.append(u)
+        return np.array(rows)
+
+    def clipped(self, plan: Array) -> Array:
+        """Planned inputs, shape (nc, m), brought within the range; those left alone stay."""
+        return np.minimum(np.maximum(plan, self.low), self.high)
+
+    def applied(self, plan: Array) -> Array:
+        """The inputs to apply, shape (m,): the first planned ones, and within the range every one of them."""
+        if self._left_alone is None:
+            first: Array = plan[0]
+            return first
+        low, high = np.atleast_2d(self._low)[0], np.atleast_2d(self._high)[0]
+        return np.asarray(np.minimum(np.maximum(plan[0], low), high))
+
+    def leaving(self, manual: BoolArray, u: Array) -> InputRange:
+        """The same range, with inputs in manual, shape (m,), left where u, shape (m,), is beyond it at some sample."""
+        beyond = manual & np.atleast_2d((u < self._low) | (u > self._high)).any(axis=0)
+        return InputRange(self._low, self._high, manual) if beyond.any() else self
+
+
+class UsualLimits:
+    """The limits of the problem, as they hold at every sample for which no others are given.
+
+    Attributes:
+        inputs: the range of the inputs. Without limits of their own they stay within what counts as a number.
+        crossed: whether some u_min is above its u_max, so that no input can keep both: never here.
+    """
+
+    crossed = False
+
+    def __init__(self, condensed: CondensedQP) -> None:
+        limits = condensed.problem.limits
+        self._condensed = condensed
+        self.inputs = InputRange(
+            np.maximum(limits.u_min, -LARGEST / 2), np.minimum(limits.u_max, LARGEST / 2)
+        )
+
+    def applied_to(self, sample: Sample) -> Sample:
+        """The sample with these limits for bounds."""
+        return sample
+
+    def with_manual(self, manual: BoolArray, u: Array) -> UsualLimits | LimitsNow:
+        """The limits with inputs in manual, shape (m,), left alone where u, shape (m,), is beyond them."""
+        if self.inputs.leaving(manual, u) is self.inputs:
+            return self
+        return LimitsNow(Limits(), self._condensed).with_manual(manual, u)
+
+
 class LimitsNow:
     """The limits of one sample, over the horizon.
 
@@ -21,12 +105,10 @@ class LimitsNow:
     replace those of the problem. What is None or not a number stays as the problem has it.
 
     Attributes:
-        u_min, u_max: shape (nc, m).
+        inputs: the range of the inputs; that of the problem where the limits cross.
         du_max: shape (nc, m).
         y_min, y_max: at i = 1..np, shape (np, l).
         crossed: whether some u_min is above its u_max, so that no input can keep both.
-        planned_min, planned_max: what plans keep, shape (nc, m): `u_min` and `u_max`, and no limits for inputs that
-            somebody else holds beyond them.
 
     Raises:
         MampcError: the wrong shape, or limits of signals for which the problem has none.
@@ -37,36 +119,37 @@ class LimitsNow:
         n_c, n_p = problem.control_horizon, problem.prediction_horizon
         known = _known(condensed)
 
-        def told(name: str, rows: int) -> Array:
-            own = getattr(usual, name)
-            given = _rows(name, getattr(limits, name), own, rows)
-            if (np.isfinite(given).any(axis=0) & ~known[name]).any():
+        def given(name: str, rows: int) -> Array:
+            values = _rows(name, getattr(limits, name), getattr(usual, name), rows)
+            if (np.isfinite(values).any(axis=0) & ~known[name]).any():
                 raise MampcError(
                     f"limits: expected {name} only of signals that have one in the problem, received "
                     f"{getattr(limits, name)!r}; give the problem a {name}, however wide"
                 )
-            return given
+            return values
 
-        self.u_min = np.maximum(told("u_min", n_c), np.maximum(usual.u_min, -LARGEST / 2))
-        self.u_max = np.minimum(told("u_max", n_c), np.minimum(usual.u_max, LARGEST / 2))
-        self.du_max = np.clip(told("du_max", n_c), 0.0, usual.du_max)
+        self._condensed = condensed
+        u_min = np.maximum(given("u_min", n_c), np.maximum(usual.u_min, -LARGEST / 2))
+        u_max = np.minimum(given("u_max", n_c), np.minimum(usual.u_max, LARGEST / 2))
+        self.crossed = bool((u_min > u_max).any())
+        self.inputs = UsualLimits(condensed).inputs if self.crossed else InputRange(u_min, u_max)
+        self.du_max = np.clip(given("du_max", n_c), 0.0, usual.du_max)
         # Beyond what counts as a number a limit is as good as none, or as one that nothing can keep.
-        self.y_min = np.minimum(told("y_min", n_p), LARGEST)
-        self.y_max = np.maximum(told("y_max", n_p), -LARGEST)
-        self.crossed = bool((self.u_min > self.u_max).any())
-        self.planned_min, self.planned_max = self.u_min, self.u_max
+        self.y_min = np.minimum(given("y_min", n_p), LARGEST)
+        self.y_max = np.maximum(given("y_max", n_p), -LARGEST)
 
-    def release(self, manual: BoolArray) -> None:
-        """Have plans leave inputs in manual, shape (m,), where they are, though they are outside their limits."""
-        self.planned_min = np.where(manual, -LARGEST, self.u_min)
-        self.planned_max = np.where(manual, LARGEST, self.u_max)
+    def with_manual(self, manual: BoolArray, u: Array) -> LimitsNow:
+        """The limits with inputs in manual, shape (m,), left alone where u, shape (m,), is beyond them."""
+        self.inputs = self.inputs.leaving(manual, u)
+        return self
 
-    def applied_to(self, sample: Sample, condensed: CondensedQP) -> Sample:
+    def applied_to(self, sample: Sample) -> Sample:
         """The sample with these limits for bounds."""
+        condensed = self._condensed
         v, n_simple = condensed.n_violations, condensed.program.n_simple
         m, l = condensed.problem.model.n_inputs, condensed.problem.model.n_outputs
         lower, upper, u = sample.lower.copy(), sample.upper.copy(), sample.u_previous
-        low, high = self.planned_min.ravel(), self.planned_max.ravel()
+        low, high = self.inputs.low.ravel(), self.inputs.high.ravel()
         if condensed.bounds.every_move:
             upper[v:n_simple] = self.du_max.ravel()
             lower[v:n_simple] = -upper[v:n_simple]
@@ -82,15 +165,17 @@ class LimitsNow:
         bound_of_move[inputs] = np.arange(rows.start, rows.stop)
         if not condensed.bounds.every_move:
             bound_of_move[:m] = np.arange(v, n_simple)
-        present = BoundsNow(
+        bounds_now = BoundsNow(
             np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), condensed.bounds.of_moves,
-            self.planned_min - u, self.planned_max - u, bound_of_move,
+            self.inputs.low - u, self.inputs.high - u, bound_of_move,
         )  # fmt: skip
-        return Sample(sample.data, sample.parts, sample.parameter, sample.u_previous, sample.frozen, present)
+        return Sample(
+            sample.data, sample.parts, sample.parameter, sample.u_previous, sample.frozen, bounds_now
+        )
 
 
 def _rows(name: str, value: Any, usual: Array, rows: int) -> Array:
-    """A limit per sample and signal, shape (rows, signals); the usual one where nothing is told."""
+    """A limit per sample and signal, shape (rows, signals); the usual one where none is given."""
     if value is None:
         return np.tile(usual, (rows, 1))
     given = as_read(name, value)
