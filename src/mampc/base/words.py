@@ -40,6 +40,11 @@ class Status(Sentence):
         "The solver failed or ran out of time: the previous inputs are held.",
     )
 
+    @property
+    def held(self) -> bool:
+        """Whether nothing could be planned, so that the previous inputs are held."""
+        return self in (Status.HELD_INFEASIBLE, Status.HELD_BAD_MEASUREMENT, Status.HELD_SOLVER_FAILED)
+
 
 class Remark(Sentence):
     """What else there is to say about a decision; `remark.sentence` says it in words."""

@@ -62,6 +62,9 @@ class Controller(ABC):
         self._x_shape = (model.n_states,)
         self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.problem!r})"
+
     @property
     def memory(self) -> int:
         """How many past inputs the controller looks back on."""

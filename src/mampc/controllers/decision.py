@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,13 +31,13 @@ class ControllerState:
     active: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Decision:
-    """One sample's decision, in engineering units; its arrays are read-only.
+class Decision(NamedTuple):
+    """One sample's decision, in engineering units; its arrays are read-only. Equal only to itself.
 
     Attributes:
         u: inputs to apply now, shape (m,); always finite and within the input limits.
-        plan: planned inputs, shape (nc, m); its first row is `u`.
+        plan: planned inputs, shape (nc, m): the last inputs applied and the sum of `changes`. Its first row is `u`, but
+            for inputs in manual that are held outside their limits: these are planned where they are.
         changes: planned moves du, shape (nc, m); with an exact pattern (polish) zero off it.
         status: how the decision came about.
         objective: cost of the plan: tracking over i = 0..np, move weights over j = 0..nc-1, output-limit
@@ -65,7 +64,7 @@ class Decision:
     state: Any
     remarks: tuple[Remark, ...]
     violations: Array
-    ignored_outputs: Mapping[str, Fault] = field(default_factory=dict)
+    ignored_outputs: Mapping[str, Fault] = {}
 
     @property
     def gap(self) -> float:
@@ -73,7 +72,7 @@ class Decision:
         gap = self.objective - self.lower_bound
         return max(0.0, gap) if gap == gap else np.inf
 
-    @cached_property
+    @property
     def moves(self) -> BoolArray:
         """Which planned changes are moves (larger than rounding), shape (nc, m)."""
         moves: BoolArray = np.abs(self.changes) > SAME
@@ -82,4 +81,23 @@ class Decision:
     @property
     def held(self) -> bool:
         """True when nothing could be planned and the previous inputs are held."""
-        return self.status.startswith("held")
+        return self.status.held
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __ne__(self, other: object) -> bool:
+        return self is not other
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __repr__(self) -> str:
+        told = [f"u={np.array2string(self.u, precision=6, threshold=8)}", str(self.status)]
+        told.append(f"{np.count_nonzero(self.moves)} of {self.moves.size} moves")
+        if not self.held:
+            told.append(f"objective={self.objective:.6g}")
+            told.append("no bound" if self.gap == np.inf else f"gap={self.gap:.3g}")
+        told += [str(remark) for remark in self.remarks]
+        told += [f"{name} {fault}" for name, fault in self.ignored_outputs.items()]
+        return f"Decision({', '.join(told)})"

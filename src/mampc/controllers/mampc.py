@@ -74,6 +74,9 @@ class MAMPC(Controller):
         # Without any rule this is plain MPC.
         self._search = None if self._admissible.unrestricted else self.method.prepare(self.condensed, rules)
 
+    def __repr__(self) -> str:
+        return f"MAMPC({self.problem!r}, {self.rules!r}, method={self.method!r})"
+
     def _check_sizes(self) -> None:
         """A least size beyond what an input can move means that it never does."""
         limits, size = self.problem.limits, self._admissible.min_size[: self.problem.model.n_inputs]

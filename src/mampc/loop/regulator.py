@@ -177,8 +177,7 @@ class Regulator:
             limits=limits,
             manual=manual,
         )
-        return replace(
-            decision,
+        return decision._replace(
             state=RegulatorState(decision.state, estimate, v, sensors, actuators.decided(decision.u)),
             ignored_outputs=judged.faults,
             solve_time=perf_counter() - start,

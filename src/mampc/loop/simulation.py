@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,7 +87,7 @@ def simulate(
         decision = regulator.step(state, outputs[k] + wobble[k], ahead, **told[k])
         state, u = decision.state, decision.u
         inputs[k] = u
-        decisions.append(replace(decision, state=None))
+        decisions.append(decision._replace(state=None))
         x = move(x, np.concatenate([u + at_inputs[k], v[k]]))
         wrong = faults(x, np.concatenate([u + at_inputs[k], v[k]]))
         if wrong:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,11 @@ class MoveRules:
             object.__setattr__(self, "blocks", tuple(as_whole("blocks", length, 1) for length in lengths))
             if not self.blocks:
                 raise MampcError("blocks: expected at least one block, received none")
+
+    def __repr__(self) -> str:
+        """Only what is not the default."""
+        values = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
+        return f"MoveRules({', '.join(f'{k}={v!r}' for k, (v, usual) in values.items() if v != usual)})"
 
     def past_changes(self, inputs: Array) -> Array:
         """Changes inside the window between the applied inputs (h, m), shape (ns - 1, m)."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
 from mampc.base.checks import as_limit, as_number, as_weight, as_whole
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, shown
 from mampc.systems.state_space import StateSpace
 
 MOST_PREDICTIONS = 5000  # future values of all outputs together; their weights take the square of it
@@ -32,6 +32,12 @@ class Limits:
     y_min: Any = None
     y_max: Any = None
 
+    def __repr__(self) -> str:
+        """Only the limits that there are."""
+        there = {field.name: getattr(self, field.name) for field in fields(self)}
+        told = {name: _short(limit) for name, limit in there.items() if limit is not None}
+        return f"Limits({', '.join(f'{k}={v}' for k, v in told.items() if v not in ('inf', '-inf'))})"
+
     def checked(self, n_inputs: int, n_outputs: int) -> Limits:
         """The same limits as arrays, infinite where there is none; raises `MampcError` if they cross."""
         limits = Limits(
@@ -50,6 +56,19 @@ class Limits:
         for name in ("u_min", "u_max", "du_max", "y_min", "y_max"):
             getattr(limits, name).flags.writeable = False
         return limits
+
+
+def _short(values: Any) -> str:
+    """A weight or limit in a few words: one number where one says it all, a diagonal, or the first entries."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return shown(values)  # not checked yet
+    if array.ndim == 2 and not (array - np.diag(np.diag(array))).any():
+        array = np.diag(array)
+    if array.size and (array == array.flat[0]).all() and array.ndim < 2:
+        return f"{array.flat[0]:g}"
+    return np.array2string(array, precision=4, threshold=12, edgeitems=2, separator=", ").replace("\n", "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,3 +151,15 @@ class TrackingProblem:
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        """One line; weights and limits of many signals in short."""
+        values = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
+        told = [f"{self.model!r}", f"prediction_horizon={self.prediction_horizon}"]
+        told += [f"control_horizon={self.control_horizon}"]
+        told += [f"{name}={_short(values[name][0])}" for name in ("output_weight", "move_weight")]
+        told += [f"limits={self.limits!r}"]
+        for name in ("weigh_first_move", "output_limit_weight", "tail_horizon"):
+            value, usual = values[name]
+            told += [f"{name}={value!r}"] if value != usual else []
+        return f"TrackingProblem({', '.join(told)})"
