@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 from mampc import MampcError, linearise
-from mampc.plants import Plant, QuadrupleTank, advance
+from mampc.plants import Plant, QuadrupleTank, SolidOxideFuelCell, advance
 
 TANK = QuadrupleTank()
 PERCENT = st.floats(0, 100)
@@ -172,3 +173,25 @@ def test_no_steady_state_exists_for_impossible_inputs(u):
 def test_every_parameter_documents_its_unit_and_source(parameter):
     assert parameter.metadata["unit"]
     assert len(parameter.metadata["source"]) > 10
+
+
+@pytest.mark.parametrize("dt", [0.1, 1.0, 10.0, 60.0, 600.0])
+def test_a_plant_is_advanced_as_exactly_as_by_an_integrator_of_higher_order(dt):
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        x, u = TANK.steady_state(rng.uniform(20, 80, 2)), rng.uniform(20, 80, 2)
+        exact = solve_ivp(
+            lambda t, h, u=u: TANK.derivative(h, u), (0, dt), x, method="DOP853", rtol=1e-12, atol=1e-12
+        )
+        np.testing.assert_allclose(advance(TANK, x, u, dt), exact.y[:, -1], rtol=2e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("plant", "dt"), [(TANK, 10.0), (TANK, 200.0), (SolidOxideFuelCell(), 0.5)])
+def test_batches_are_advanced_as_one_by_one(plant, dt):
+    rng = np.random.default_rng(5)
+    x, u = np.array(plant.steady_state()), np.array(plant.u_op)
+    states, inputs = x * rng.uniform(0.9, 1.1, (3, 4, len(x))), u * rng.uniform(0.9, 1.1, (3, 4, len(u)))
+    states[0, 0], inputs[0, 0] = 1e-3 * x, 0.8 * u  # nearly empty: another number of steps
+    ends = advance(plant, states, inputs, dt)
+    for i in np.ndindex(3, 4):
+        np.testing.assert_allclose(ends[i], advance(plant, states[i], inputs[i], dt), rtol=1e-12)

@@ -10,6 +10,8 @@ from mampc.base.words import Fault, Remark, Status
 from mampc.controllers import MAMPC, MPC, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
 from mampc.identification import Export, Identified, IOData, Validation, excite, n4sid, read_export, validate
+from mampc.loop import loads
+from mampc.loop.batch import Batch, simulate_batch
 from mampc.loop.estimation import KalmanFilter
 from mampc.loop.metrics import Metrics
 from mampc.loop.regulator import Regulator
@@ -18,6 +20,7 @@ from mampc.loop.run import Run
 from mampc.loop.sensors import SensorChecks
 from mampc.loop.simulation import simulate
 from mampc.loop.state import RegulatorState
+from mampc.loop.valves import Valves
 from mampc.methods import (
     ADMM,
     L1,
@@ -43,6 +46,7 @@ __all__ = [
     "METHODS",
     "MPC",
     "Alternating",
+    "Batch",
     "ControllerState",
     "Decision",
     "Difference",
@@ -72,15 +76,18 @@ __all__ = [
     "StudyError",
     "TrackingProblem",
     "Validation",
+    "Valves",
     "excite",
     "largest_offset",
     "linearise",
+    "loads",
     "n4sid",
     "plants",
     "prbs",
     "read_export",
     "replay",
     "simulate",
+    "simulate_batch",
     "steps",
     "validate",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mampc.base.errors import MampcError
 
@@ -50,6 +50,13 @@ class Names:
         """A name with its unit, where that is known: `u1 (%)`."""
         unit = dict(self.units).get(name)
         return f"{name} ({unit})" if unit else name
+
+    def undisturbed(self) -> Names:
+        """The same without measured disturbances."""
+        units = tuple(
+            (name, unit) for name, unit in dict(self.units).items() if name not in self.disturbances
+        )
+        return replace(self, disturbances=(), units=units)
 
     @classmethod
     def numbered(cls, inputs: int, outputs: int, states: int = 0) -> Names:

@@ -167,7 +167,7 @@ def excite(
     names, l = plant.names, len(plant.names.outputs)
     signal = _column("u", u)
     if signal.shape[1] == len(names.inputs) and not isinstance(plant, StateSpace):
-        names = replace(names, disturbances=())
+        names = names.undisturbed()
     signal = as_matrix("u", signal, None, len(names.inputs) + len(names.disturbances))
     if isinstance(plant, StateSpace):
         y = plant.response(signal, x0)

@@ -198,6 +198,22 @@ class KalmanFilter:
         x, at_outputs, at_inputs, innovation, movement = self._parts
         return Updated(Estimate(data[x], data[at_outputs], data[at_inputs]), data[innovation], data[movement])
 
+    def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
+        """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
+        parts = (
+            last.x,
+            last.output_disturbance,
+            last.input_disturbance,
+            u,
+            v_last,
+            v,
+            y,
+            np.ones((len(y), 1)),
+        )
+        data = np.concatenate(parts, axis=1) @ self._update.T
+        x, at_outputs, at_inputs, innovation, movement = (data[:, part] for part in self._parts)
+        return Updated(Estimate(x, at_outputs, at_inputs), innovation, movement)
+
     def _everyday(self) -> tuple[Array, list[slice]]:
         """The matrix of `update`, and where the parts of its result stand."""
         model = self.model

@@ -1,13 +1,17 @@
-"""Figures of merit of a closed-loop run: how often, how far and how well."""
+"""Figures of merit of a closed-loop run: how often, how far and how well, and what that wears."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_number, as_whole
+from mampc.base.checks import Array, as_number, as_vector, as_whole
+from mampc.base.errors import MampcError
 from mampc.base.tolerances import SAME
+
+Counts = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +29,12 @@ class Metrics:
         travel: sum of |du|, in input units.
         reversals: how often an input moves against its previous move.
         mean_hold_time: mean time an input stays where it is, in seconds.
+        median_hold_time, longest_hold_time: of the times between moves, in seconds; the first begins and the last
+            ends with the run.
+        dead_band: of the actuators, in input units.
+        starts: how often the actuator itself starts: each time its input has come more than its dead-band away from
+            where it stands.
+        starts_per_hour: of them.
     """
 
     steps: int
@@ -33,35 +43,57 @@ class Metrics:
     sparse_density: Array
     exact_density: Array
     tracking_error: float
-    moves: np.ndarray[tuple[int], np.dtype[np.int64]]
+    moves: Counts
     travel: Array
-    reversals: np.ndarray[tuple[int], np.dtype[np.int64]]
+    reversals: Counts
     mean_hold_time: Array
+    median_hold_time: Array
+    longest_hold_time: Array
+    dead_band: Array
+    starts: Counts
+    starts_per_hour: Array
 
 
 def compute(
-    u: Array, y: Array, r: Array, u_initial: Array, dt: float, *, threshold: float = 0.1, skip: int = 0
+    u: Array,
+    y: Array,
+    r: Array,
+    u_initial: Array,
+    dt: float,
+    *,
+    threshold: float = 0.1,
+    skip: int = 0,
+    dead_band: Any = 0.0,
+    position: Array | None = None,
 ) -> Metrics:
     """Metrics of a trajectory.
 
     Args:
-        u, y, r: applied inputs (T, m), outputs (T, l) and references (T, l), engineering units.
+        u, y, r: decided inputs (T, m), outputs (T, l) and references (T, l), engineering units.
         u_initial: inputs before the first sample, shape (m,); moving away from them counts.
         dt: sample time in seconds.
         threshold: see `Metrics`.
         skip: samples to leave out at the start, 0 <= skip < T.
+        dead_band: changes that an actuator does not answer, in input units, one number or one per input.
+        position: where the actuators were, shape (T, m), whose starts are counted; default the decided inputs.
 
     Source: paper, eqs. 10 and 11.
 
     Raises:
-        MampcError: skip or threshold out of range.
+        MampcError: skip, threshold or dead-band out of range.
     """
     skip = as_whole("skip", skip, 0, len(u) - 1)
     threshold = as_number("threshold", threshold, 0.0)
+    band = as_vector("dead_band", dead_band, u.shape[1])
+    if (band < 0).any():
+        raise MampcError(f"dead_band: expected numbers of at least 0, received {dead_band!r}")
     changes = np.diff(np.vstack([u_initial, u]), axis=0)[skip:]
     size = np.abs(changes)
     steps, moved = len(size), size > SAME
     moves = moved.sum(axis=0)
+    holds = [np.diff(np.concatenate([[0], np.flatnonzero(column), [steps]])) * dt for column in moved.T]
+    real = np.vstack([u_initial, u if position is None else position])[skip:]
+    starts = np.array([_starts(column, width) for column, width in zip(real.T, band, strict=True)])
     return Metrics(
         steps=steps,
         skipped=skip,
@@ -75,9 +107,26 @@ def compute(
             [_reversals(column[kept]) for column, kept in zip(changes.T, moved.T, strict=True)]
         ),
         mean_hold_time=steps * dt / (moves + 1),
+        median_hold_time=np.array([np.median(times[times > 0]) for times in holds]),
+        longest_hold_time=np.array([times.max() for times in holds]),
+        dead_band=band,
+        starts=starts,
+        starts_per_hour=starts * 3600 / (steps * dt),
     )
 
 
 def _reversals(moves: Array) -> int:
     direction = np.sign(moves)
     return int(np.count_nonzero(direction[1:] != direction[:-1]))
+
+
+def _starts(course: Array, dead_band: float) -> int:
+    """How often an actuator has to start that stands at course[0] and follows beyond its dead-band."""
+    moved = np.abs(np.diff(course)) > SAME
+    if dead_band <= SAME:
+        return int(np.count_nonzero(moved))
+    starts, stands = 0, float(course[0])
+    for wanted in course[1:][moved].tolist():
+        if abs(wanted - stands) > dead_band:
+            starts, stands = starts + 1, wanted
+    return starts

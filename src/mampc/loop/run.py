@@ -6,11 +6,12 @@ import csv
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.base.errors import MampcError
 from mampc.base.files import written_whole
 from mampc.base.names import Names
 from mampc.controllers.decision import Decision
@@ -28,7 +29,7 @@ class Run:
 
     Attributes:
         t: time in seconds, shape (T,).
-        u: applied inputs, shape (T, m); u[k] acts from t[k] on.
+        u: decided inputs, shape (T, m); u[k] acts from t[k] on.
         y: true outputs at t[k], shape (T, l), without measurement noise.
         y_measured: what the regulator saw, shape (T, l).
         r: reference, shape (T, l).
@@ -36,6 +37,7 @@ class Run:
         decisions: the regulator's decisions, with their states left out.
         v: measured disturbances, shape (T, d).
         faults: sample -> what took the plant out of its range there (see `Plant`); empty if nothing did.
+        position: where the actuators were, shape (T, m): the decided inputs unless there are `Valves`.
         dt: sample time in seconds.
         names: of the inputs and outputs.
     """
@@ -51,19 +53,25 @@ class Run:
     names: Names
     v: Array
     faults: dict[int, tuple[str, ...]]
+    position: Array = None  # type: ignore[assignment]  # always set after construction
+
+    def __post_init__(self) -> None:
+        if self.position is None:
+            object.__setattr__(self, "position", self.u)
 
     def __repr__(self) -> str:
         statuses = ", ".join(f"{count} {status}" for status, count in self.statuses.items())
         return (
             f"Run({len(self.t)} samples of {self.dt:g} s, {self.u.shape[1]} inputs, {self.y.shape[1]} outputs, "
-            f"decisions: {statuses})"
+            f"decisions: {statuses or 'not kept'})"
         )
 
-    def metrics(self, *, threshold: float = 0.1, skip: int = 0) -> Metrics:
+    def metrics(self, *, threshold: float = 0.1, skip: int = 0, dead_band: Any = 0.0) -> Metrics:
         """How often the inputs move and how well the outputs follow; see `Metrics`."""
         return metrics.compute(
-            self.u, self.y, self.r, self.u_initial, self.dt, threshold=threshold, skip=skip
-        )
+            self.u, self.y, self.r, self.u_initial, self.dt,
+            threshold=threshold, skip=skip, dead_band=dead_band, position=self.position,
+        )  # fmt: skip
 
     @property
     def solve_times(self) -> Array:
@@ -97,9 +105,13 @@ class Run:
         return signals_figure({"closed loop": self}, look={"closed loop": Look(BLUE)}, limits=limits)
 
     def to_csv(self, path: str | Path) -> None:
-        """Write time, inputs, measured disturbances, outputs, references, status, remarks and ignored outputs, in
+        """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs, in
         full precision.
         """
+        if len(self.decisions) != len(self.t):
+            raise MampcError(
+                "to_csv: expected a run with its decisions, received none; pass keep_decisions=True"
+            )
         inputs, outputs = self.names.inputs, self.names.outputs
         header = [
             "time", *inputs, *self.names.disturbances, *outputs,

@@ -184,12 +184,7 @@ class Sensors:
             disturbance: estimated at the outputs before this sample, shape (l,).
         """
         if self._is_fine(state, y, innovation):  # the everyday case, at once
-            zeros, step, longest = (
-                self._zeros,
-                self._step(state, y, self._all),
-                self._longest(state, self._all),
-            )
-            return self._fine, SensorState(y.copy(), zeros, zeros, zeros, zeros, disturbance, longest, step)
+            return self._fine, self.after_fine(state, y, disturbance)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))
         came = ~(missing | out)
@@ -227,6 +222,18 @@ class Sensors:
             now != last and -jump <= e <= jump and a <= now <= b for now, last, e, (jump, a, b) in pairs
         )
 
+    def are_fine(self, state: SensorState, y: Array, innovation: Array) -> BoolArray:
+        """The same of many loops, whose arrays have these first, shape (S,)."""
+        near = (y != state.y) & (np.abs(innovation) <= self._jump) & (y >= self._low) & (y <= self._high)
+        fine: BoolArray = np.asarray(near.all(axis=1))
+        return fine
+
+    def after_fine(self, state: SensorState, y: Array, disturbance: Array) -> SensorState:
+        """The next state where all outputs were fine, of one loop or of many."""
+        zeros = self._zeros if y.ndim == 1 else np.zeros_like(y)
+        step, longest = self._step(state, y, self._all), self._longest(state, self._all)
+        return SensorState(y.copy(), zeros, zeros, zeros, zeros, disturbance, longest, step)
+
     def _is_stuck(self, state: SensorState, repeats: Array, moved: Array) -> BoolArray:
         """The outputs that have shown the same for too long, though the model moved them, shape (l,)."""
         coarse = state.step > self._coarse_step
@@ -253,7 +260,13 @@ class Sensors:
     def _step(self, state: SensorState, y: Array, changed: BoolArray) -> Array:
         """The greatest common divisor of all changes so far, shape (l,), found step by step."""
         step = state.step
-        if all(0.0 < size <= coarse for size, coarse in zip(step.tolist(), self._coarse, strict=True)):
+        if step.ndim > 1:
+            settled = bool(((step > 0.0) & (step <= self._coarse_step)).all())
+        else:
+            settled = all(
+                0.0 < size <= coarse for size, coarse in zip(step.tolist(), self._coarse, strict=True)
+            )
+        if settled:
             return step
         change, known = np.where(changed, np.abs(y - state.y), 0.0), np.where(step > 0.0, step, 1.0)
         rest = np.fmod(change, known)

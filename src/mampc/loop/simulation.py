@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mampc.base.checks import Array, as_array, as_matrix, as_vector, as_whole
 from mampc.base.errors import MampcError
+from mampc.loop.loads import Load, drawn
+from mampc.loop.motion import Faults, motion_of
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.state import RegulatorState
-from mampc.plants import Plant, advance
+from mampc.loop.valves import Valves
+from mampc.plants import Plant
 from mampc.systems.state_space import StateSpace
-
-if TYPE_CHECKING:
-    pass
 
 
 def simulate(
@@ -31,6 +33,8 @@ def simulate(
     input_disturbance: Any = None,
     output_disturbance: Any = None,
     measured_disturbance: Any = None,
+    loads: Sequence[Load] = (),
+    valves: Valves | None = None,
     u_initial: Any = None,
     progress: bool | None = None,
 ) -> Run:
@@ -42,18 +46,68 @@ def simulate(
         reference: absolute outputs to track: constant (l,), or one row per sample (T, l).
         steps: T; default the rows of the reference.
         noise: standard deviation of Gaussian measurement noise, scalar or (l,), in output units.
-        seed: of the noise; equal seeds give equal noise whatever the regulator.
+        seed: of noise and loads; equal seeds give equal ones whatever the regulator.
         preview: let the regulator see the reference over its prediction horizon.
         input_disturbance: unmeasured, added to the inputs on their way to the plant, (m,) or (T, m).
         output_disturbance: unmeasured, added to the true outputs, (l,) or (T, l).
         measured_disturbance: of the plant, and told to the regulator if its model has it, (d,) or (T, d);
             default the plant's usual ones (its `v_op`).
+        loads: of `mampc.loads`, drawn with the seed and added to these disturbances.
+        valves: what stands between decided and real inputs (see `Valves`); default inputs are as decided.
         u_initial: inputs at the start, shape (m,); default the plant's usual ones (its `u_op`).
         progress: show a progress bar on the terminal; default: when the run is long.
 
     Raises:
         MampcError: arguments that do not fit together, or a plant that cannot be integrated.
     """
+    course = course_of(
+        plant, regulator, reference, steps=steps, noise=noise, seed=seed,
+        input_disturbance=input_disturbance, output_disturbance=output_disturbance,
+        measured_disturbance=measured_disturbance, loads=loads, u_initial=u_initial,
+    )  # fmt: skip
+    return closed_loop(plant, regulator, course, preview=preview, valves=valves, progress=progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What acts on a loop of T samples from outside.
+
+    Attributes:
+        reference: as long as it is predicted, shape (T + np, l).
+        noise: of the measurements, shape (T, l).
+        at_inputs, at_outputs: unmeasured disturbances, shapes (T, m) and (T, l).
+        v: measured disturbances, shape (T, d).
+        u_initial: inputs before the first sample, shape (m,).
+    """
+
+    reference: Array
+    noise: Array
+    at_inputs: Array
+    at_outputs: Array
+    v: Array
+    u_initial: Array
+
+    def __len__(self) -> int:
+        return len(self.noise)
+
+
+def course_of(
+    plant: Plant | StateSpace,
+    regulator: Regulator,
+    reference: Any,
+    *,
+    steps: int | None,
+    noise: Any,
+    seed: int,
+    input_disturbance: Any,
+    output_disturbance: Any,
+    measured_disturbance: Any,
+    loads: Sequence[Load],
+    u_initial: Any,
+) -> Course:
+    """What the arguments of `simulate` say, checked and drawn."""
+    if not isinstance(regulator, Regulator):
+        raise MampcError(f"regulator: expected a mampc.Regulator, received {type(regulator).__name__}")
     model = regulator.controller.problem.model
     m, l, d = model.n_inputs, model.n_outputs, len(plant.names.disturbances)
     if (len(plant.names.inputs), len(plant.names.outputs)) != (m, l) or model.n_disturbances not in (0, d):
@@ -64,37 +118,67 @@ def simulate(
     T = _length(reference, steps)
     rows = _trajectory("reference", reference, l, None if np.ndim(reference) == 2 else T)
     horizon = regulator.controller.problem.prediction_horizon
-    known = rows[np.minimum(np.arange(T + horizon), len(rows) - 1)]
-    r = known[:T]
     spread = as_vector("noise", noise, l)
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
-    wobble = spread * np.random.default_rng(as_whole("seed", seed, 0)).standard_normal((T, l))
-    at_inputs = _trajectory("input_disturbance", _default(input_disturbance, 0.0), m, T)
-    at_outputs = _trajectory("output_disturbance", _default(output_disturbance, 0.0), l, T)
+    seed = as_whole("seed", seed, 0)
     usual = getattr(plant, "v_op", np.zeros(d))
-    v = _trajectory("measured_disturbance", _default(measured_disturbance, usual), d, T)
-    start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
+    at = {
+        "input": _trajectory("input_disturbance", _default(input_disturbance, 0.0), m, T),
+        "output": _trajectory("output_disturbance", _default(output_disturbance, 0.0), l, T),
+        "measured": _trajectory("measured_disturbance", _default(measured_disturbance, usual), d, T),
+    }
+    for place, load in drawn(loads, T, model.dt, seed, {place: rows.shape[1] for place, rows in at.items()}):
+        at[place] = at[place] + load
+    return Course(
+        reference=rows[np.minimum(np.arange(T + horizon), len(rows) - 1)],
+        noise=spread * np.random.default_rng(seed).standard_normal((T, l)),
+        at_inputs=at["input"], at_outputs=at["output"], v=at["measured"],
+        u_initial=as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m),
+    )  # fmt: skip
 
-    output, move, faults = _sampled(plant, model.dt)
+
+def closed_loop(
+    plant: Plant | StateSpace,
+    regulator: Regulator,
+    course: Course,
+    *,
+    preview: bool,
+    valves: Valves | None,
+    progress: bool | None,
+) -> Run:
+    """The loop sample by sample."""
+    model, horizon = regulator.controller.problem.model, regulator.controller.problem.prediction_horizon
+    T, start, v, r = len(course), course.u_initial, course.v, course.reference[: len(course)]
+    motion = motion_of(plant, model.dt)
     told: list[dict[str, Any]] = [{"measured_disturbance": now} if model.n_disturbances else {} for now in v]
     x, state = at_rest(plant, regulator, start, v[0])
-    inputs, outputs, decisions, found = np.empty((T, m)), np.empty((T, l)), [], {}
-    u = start
-    for k in _watched(T, progress):
-        outputs[k] = output(x, np.concatenate([u + at_inputs[k], v[k]])) + at_outputs[k]
-        ahead = known[k : k + horizon + 1] if preview else r[k]
-        decision = regulator.step(state, outputs[k] + wobble[k], ahead, **told[k])
-        state, u = decision.state, decision.u
-        inputs[k] = u
+    shape = (T, len(start))
+    inputs, positions, outputs = np.empty(shape), np.empty(shape), np.empty((T, model.n_outputs))
+    decisions, found = [], dict[int, Faults]()
+    stem = None if valves is None else valves.initial(start)
+    position = start
+    for k in watched(T, progress):
+        outputs[k] = (
+            motion.output(x, np.concatenate([position + course.at_inputs[k], v[k]])) + course.at_outputs[k]
+        )
+        ahead = course.reference[k : k + horizon + 1] if preview else r[k]
+        decision = regulator.step(state, outputs[k] + course.noise[k], ahead, **told[k])
+        state, position = decision.state, decision.u
+        inputs[k] = decision.u
+        if stem is not None:
+            stem = stem.moved(decision.u)
+            position = stem.position
+        positions[k] = position
         decisions.append(decision._replace(state=None))
-        x = move(x, np.concatenate([u + at_inputs[k], v[k]]))
-        wrong = faults(x, np.concatenate([u + at_inputs[k], v[k]]))
+        applied = np.concatenate([position + course.at_inputs[k], v[k]])
+        x = motion.move(x, applied)
+        wrong = motion.faults(x, applied)
         if wrong:
             found[k] = wrong
     return Run(
-        t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + wobble, r=r, u_initial=start,
-        decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found,
+        t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + course.noise, r=r, u_initial=start,
+        decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found, position=positions,
     )  # fmt: skip
 
 
@@ -106,7 +190,7 @@ def at_rest(
     """
     model, both = regulator.controller.problem.model, np.concatenate([u, v])
     x = plant.steady_state(both)
-    y = _sampled(plant, model.dt)[0](x, both)
+    y = motion_of(plant, model.dt).output(x, both)
     told = {"measured_disturbance": v} if model.n_disturbances else {}
     return x, regulator.initial_state(u, y, **told)
 
@@ -125,21 +209,6 @@ def _default(value: Any, otherwise: Any) -> Any:
     return otherwise if value is None else value
 
 
-def _sampled(plant: Plant | StateSpace, dt: float) -> tuple[Any, Any, Any]:
-    """The plant's output, its motion over one sample, and what is wrong with it."""
-    if not isinstance(plant, StateSpace):
-        faults = getattr(plant, "faults", lambda x, u: ())
-        return plant.output, lambda x, u: advance(plant, x, u, dt), faults
-    if not np.isclose(plant.dt, dt, rtol=1e-6):
-        raise MampcError(f"simulate: expected a plant sampled every {dt:g} s, received {plant.dt:g} s")
-    A, B, C, D, op, y_op = plant.A, plant.B, plant.C, plant.D, plant.all_inputs_op, plant.y_op
-    return (
-        lambda x, u: y_op + C @ x + D @ (u - op),
-        lambda x, u: A @ x + B @ (u - op),
-        lambda x, u: (),
-    )
-
-
 def _trajectory(name: str, value: Any, width: int, steps: int | None) -> Array:
     """One row per sample, from a constant or from rows of which the last is repeated."""
     array = as_array(name, value)
@@ -154,7 +223,7 @@ def _trajectory(name: str, value: Any, width: int, steps: int | None) -> Array:
     return rows[np.minimum(np.arange(steps), len(rows) - 1)]
 
 
-def _watched(steps: int, progress: bool | None) -> Any:
+def watched(steps: int, progress: bool | None) -> Any:
     """0..steps-1, with a progress bar that shows itself once the run has taken two seconds."""
     if progress is False:
         return range(steps)

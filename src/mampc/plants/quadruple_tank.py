@@ -43,6 +43,8 @@ class QuadrupleTank:
     names: ClassVar[Names] = Names(
         ("u1", "u2"), ("y1", "y2"), ("h1", "h2", "h3", "h4"), units={"u1": "%", "u2": "%"}
     )
+    _inflow: ClassVar[Array]
+    _outflow: ClassVar[Array]
 
     def __post_init__(self) -> None:
         for name, size in (("areas", 4), ("outlets", 4), ("k_pump", 2), ("gamma", 2), ("u_op", 2)):
@@ -56,18 +58,18 @@ class QuadrupleTank:
         as_number("QuadrupleTank.k_c", self.k_c, 0.0, exclusive=True)
         if not all(0 <= split <= 1 for split in self.gamma):
             raise MampcError(f"QuadrupleTank.gamma: expected numbers within 0..1, received {self.gamma}")
+        # Levels rise by u @ inflow + sqrt(h) @ outflow: each pump feeds a lower and an upper tank, and each upper
+        # tank the lower one below it.
+        (g1, g2), (k1, k2) = self.gamma, self.k_pump
+        fed = np.array([[g1 * k1, 0.0, 0.0, (1 - g1) * k1], [0.0, g2 * k2, (1 - g2) * k2, 0.0]])
+        falls = np.diag(np.array(self.outlets) * np.sqrt(2 * self.gravity))
+        object.__setattr__(self, "_inflow", fed / self.areas)
+        object.__setattr__(self, "_outflow", falls @ (np.eye(4, k=-2) - np.eye(4)) / self.areas)
 
     def derivative(self, x: Array, u: Array) -> Array:
         """dh/dt in cm/s; an empty tank has no outflow, so that levels stay at or above zero."""
         x, u = np.asarray(x, dtype=float), np.asarray(u, dtype=float)
-        out = np.array(self.outlets) * np.sqrt(2 * self.gravity * np.maximum(x, 0.0))
-        f1, f2 = np.moveaxis(np.array(self.k_pump) * np.maximum(u, 0.0), -1, 0)
-        g1, g2 = self.gamma
-        inflow = np.stack(
-            np.broadcast_arrays(out[..., 2] + g1 * f1, out[..., 3] + g2 * f2, (1 - g2) * f2, (1 - g1) * f1),
-            axis=-1,
-        )
-        rate: Array = (inflow - out) / np.array(self.areas)
+        rate: Array = np.maximum(u, 0.0) @ self._inflow + np.sqrt(np.maximum(x, 0.0)) @ self._outflow
         return rate
 
     def output(self, x: Array, u: Array | None = None) -> Array:

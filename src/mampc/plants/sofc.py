@@ -190,16 +190,16 @@ class SolidOxideFuelCell:
         return np.concatenate(pressures, axis=-1)
 
     def faults(self, x: Array, u: Array | None = None) -> tuple[str, ...]:
-        """What takes the model out of its range at a state (4,) and inputs; empty if nothing does."""
+        """What takes the model out of its range at a state (..., 4), or at some of a batch, and inputs."""
         x = np.asarray(x, dtype=float)
         found = []
         if float(np.max(self._current(u))) / self.cell_area >= self.limiting_current:
             found.append("limiting current density")
-        if x[0] < _SCARCE:
+        if x[..., 0].min() < _SCARCE:
             found.append("H2 starvation")
-        if x[2] < _SCARCE:
+        if x[..., 2].min() < _SCARCE:
             found.append("O2 starvation")
-        if min(x[0] + x[1], x[2] + x[3]) < self.atmosphere:
+        if min((x[..., 0] + x[..., 1]).min(), (x[..., 2] + x[..., 3]).min()) < self.atmosphere:
             found.append("pressure below atmospheric")
         return tuple(found)
 

@@ -349,7 +349,7 @@ def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
     m = len(inputs) if names is None else len(names.inputs)
     if names is not None and len(inputs) == m:
         inputs = np.concatenate([inputs, as_array("v_op", getattr(plant, "v_op", ()))])
-        names = names if len(inputs) > m else replace(names, disturbances=())
+        names = names if len(inputs) > m else names.undisturbed()
     x_op = as_array("steady_state", plant.steady_state(inputs))
 
     def jacobian(function: Any, point: Array) -> Array:

@@ -1,0 +1,196 @@
+"""First inputs of many loops at once, where plain MPC or the exact search need no solver.
+
+Everything a sample needs is affine in its parameter p, so one product per quantity serves all loops: the optimum
+with every move free, and that on any one pattern. Its map is read off on unit vectors. The best pattern comes from a
+table of what patterns cost more than the free optimum d*: with E the moves that a pattern leaves out,
+
+    |T d*_E|^2 + price of the pattern,    T the lower right block of a QR of U with E's columns last,
+
+linear in the products d*_i d*_k. A loop is left undecided, for an ordinary step, where an optimum breaks a limit, where
+another pattern is as good up to rounding, or where anything else asks for a closer look.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+
+from mampc.base.checks import LARGEST, Array, BoolArray
+from mampc.base.tolerances import INSIDE, ROUNDING, SAME, TIE
+from mampc.controllers import MAMPC, MPC
+from mampc.controllers.controller import Controller
+from mampc.methods import Exact
+from mampc.moves.admissible import AdmissiblePatterns, Allowance
+from mampc.program.sample import Optimum, Sample
+
+LARGEST_TABLE = 1_000_000  # entries
+BLOCK = 1_000_000  # entries of the costs of all patterns in some loops that are looked at together
+MOST_KEPT = 1000  # maps of patterns, and pasts
+
+
+class Maps:
+    """What one optimum without limits gives, by its map: margins, moves and first inputs of many loops."""
+
+    def __init__(self, optima: list[Optimum], m: int) -> None:
+        """From the values at each unit vector."""
+        self._margins = np.array([optimum.margins for optimum in optima])
+        self._moves = np.array([optimum.moves for optimum in optima])
+        self._inputs = np.array([optimum.inputs[:m] for optimum in optima])
+
+    def at(self, parameters: Array) -> tuple[BoolArray, Array, Array]:
+        """For parameters (S, p): whether all limits are kept (S,), moves (S, n_moves), first inputs (S, m)."""
+        margins = parameters @ self._margins
+        inside: BoolArray = margins.min(axis=1, initial=np.inf) > INSIDE
+        return inside, parameters @ self._moves, parameters @ self._inputs
+
+
+class BatchedPlans:
+    """The plans of many loops under one controller; see `batched_plans` for those that there are."""
+
+    def __init__(self, controller: Controller, preview: bool) -> None:
+        problem, condensed = controller.problem, controller.condensed
+        model, self._condensed = problem.model, condensed
+        limits = problem.limits
+        self._m = m = model.n_inputs
+        self._low, self._high = np.maximum(limits.u_min, -LARGEST / 2), np.minimum(limits.u_max, LARGEST / 2)
+        reference = np.zeros(
+            (problem.prediction_horizon + 1, model.n_outputs) if preview else model.n_outputs
+        )
+        size = len(condensed.parameter.vector(np.zeros(model.n_states), np.zeros(m), reference))
+        self._units: list[Sample] = [condensed.sample(unit, np.zeros(m)) for unit in np.eye(size)]
+        self._free = Maps(list(self._units), m)
+        self.memory = controller.memory
+
+    def decide(self, parameters: Array, inputs: Array) -> tuple[BoolArray, Array]:
+        """Which loops are decided, shape (S,), and their inputs, shape (S, m).
+
+        Args:
+            parameters: of `Parameter`, shape (S, p).
+            inputs: applied so far, latest last, shape (S, h, m).
+        """
+        decided, _, first = self._free.at(parameters)
+        return decided & ((first >= self._low) & (first <= self._high)).all(axis=1), first
+
+
+class BatchedExact(BatchedPlans):
+    """The exact search of many loops, by a table of all patterns."""
+
+    def __init__(
+        self, controller: MAMPC, preview: bool, admissible: AdmissiblePatterns, patterns: BoolArray
+    ) -> None:
+        super().__init__(controller, preview)
+        self._admissible, self._patterns = admissible, patterns
+        self._counts = np.array([admissible.count(pattern) for pattern in patterns])
+        self._charge = np.array([admissible.charge(pattern) for pattern in patterns])
+        U = self._condensed.U
+        self._size = np.linalg.norm(U, axis=0)
+        U = U / self._size  # in units that make all moves alike
+        self._rows, self._columns = np.triu_indices(len(U))
+        doubled = np.where(self._rows == self._columns, 1.0, 2.0)
+        self._table = np.empty((len(self._rows), len(patterns)))
+        for column, pattern in enumerate(self._patterns):
+            last, kept = np.flatnonzero(~pattern), int(pattern.sum())
+            columns = np.concatenate([np.flatnonzero(pattern), last])
+            triangle = np.asarray(np.linalg.qr(U[:, columns], mode="r"))[kept:, kept:]
+            excess = np.zeros_like(U)
+            excess[np.ix_(last, last)] = triangle.T @ triangle
+            self._table[:, column] = excess[self._rows, self._columns] * doubled
+        # Of the sum of |d*_i d*_k| in those units: what rounding may do to a cost.
+        self._rounding = 1e-13 + 100 * np.finfo(float).eps * float(np.linalg.cond(U))
+        self._maps: OrderedDict[int, Maps] = OrderedDict()
+        self._allowances: dict[bytes, Allowance] = {}
+        self._costs: dict[Allowance, Array] = {}
+
+    def decide(self, parameters: Array, inputs: Array) -> tuple[BoolArray, Array]:
+        first = inputs[:, -1].copy()
+        decided: BoolArray = ((first >= self._low) & (first <= self._high)).all(axis=1)
+        optima = self._free.at(parameters)[1] * self._size
+        best, clear = self._best(optima, inputs)
+        decided &= clear
+        order = np.argsort(best, kind="stable")
+        ends = np.flatnonzero(np.diff(best[order], append=-1))
+        for group in np.split(order, ends[:-1] + 1):
+            inside, moves, u = self._map(int(best[group[0]])).at(parameters[group])
+            small = np.abs(moves)
+            decided[group] &= inside & ~((small > 0) & (small <= ROUNDING)).any(axis=1)
+            decided[group] &= ((u >= self._low) & (u <= self._high)).all(axis=1)
+            first[group] = u
+        return decided, first
+
+    def _best(
+        self, optima: Array, inputs: Array
+    ) -> tuple[np.ndarray[tuple[int], np.dtype[np.intp]], BoolArray]:
+        """The best pattern of each loop, shape (S,), and whether no other is as good."""
+        best, clear = np.empty(len(optima), dtype=np.intp), np.empty(len(optima), dtype=bool)
+        costs = self._pattern_costs(inputs)
+        block = max(1, BLOCK // len(self._patterns))
+        for start in range(0, len(optima), block):
+            part = slice(start, start + block)
+            d = optima[part]
+            values = (d.take(self._rows, axis=1) * d.take(self._columns, axis=1)) @ self._table
+            values += costs[part] if len(costs) > 1 else costs
+            each = np.arange(len(d))
+            chosen = values.argmin(axis=1)
+            least = values[each, chosen]
+            values[each, chosen] = np.inf
+            second = values.min(axis=1, initial=np.inf)
+            doubt = self._rounding * np.abs(d).sum(axis=1) ** 2 + TIE * np.abs(least)
+            best[part], clear[part] = chosen, second - least > doubt
+        return best, clear
+
+    def _pattern_costs(self, inputs: Array) -> Array:
+        """The price of each pattern, infinite where the inputs so far (S, h, m) forbid it; (S, K) or (1, K)."""
+        if inputs.shape[1] == 1:
+            return self._cost(self._admissible.allowance(inputs[0]))[None]
+        moved = np.packbits((np.abs(np.diff(inputs, axis=1)) > SAME).reshape(len(inputs), -1), axis=1)
+        kinds, which = np.unique(moved, axis=0, return_inverse=True)
+        firsts = [int(np.flatnonzero(which == kind)[0]) for kind in range(len(kinds))]
+        costs = np.array([self._cost(self._allowance(moved[s].tobytes(), inputs[s])) for s in firsts])
+        return costs[which.ravel()]
+
+    def _allowance(self, moved: bytes, inputs: Array) -> Allowance:
+        """What inputs (h, m) allow, which depends on nothing but on which of them moved when."""
+        known = self._allowances.get(moved)
+        if known is None:
+            if len(self._allowances) > MOST_KEPT:
+                self._allowances.clear()
+            known = self._allowances[moved] = self._admissible.allowance(inputs)
+        return known
+
+    def _cost(self, allowance: Allowance) -> Array:
+        known = self._costs.get(allowance)
+        if known is None:
+            if len(self._costs) > MOST_KEPT:
+                self._costs.clear()
+            forbidden = self._counts > allowance.left
+            if any(allowance.frozen):
+                forbidden |= (self._patterns & ~self._admissible.open(allowance)).any(axis=1)
+            known = self._costs[allowance] = np.where(forbidden, np.inf, self._charge)
+        return known
+
+    def _map(self, index: int) -> Maps:
+        known = self._maps.get(index)
+        if known is None:
+            optimum = self._condensed.optimum_on(self._patterns[index])
+            known = self._maps[index] = Maps([optimum.at(unit) for unit in self._units], self._m)
+            if len(self._maps) > MOST_KEPT:
+                self._maps.popitem(last=False)
+        return known
+
+
+def batched_plans(controller: Controller, preview: bool) -> BatchedPlans | None:
+    """The plans of many loops under one controller, or None for controllers that are stepped one by one."""
+    if type(controller) is MPC:
+        return BatchedPlans(controller, preview)
+    if type(controller) is not MAMPC or type(controller.method) is not Exact:
+        return None
+    problem = controller.problem
+    admissible = AdmissiblePatterns(controller.rules, problem.model.n_inputs, problem.control_horizon)
+    if admissible.unrestricted:
+        return BatchedPlans(controller, preview)
+    if admissible.sized:
+        return None
+    n = controller.condensed.n_moves
+    patterns = admissible.listed(LARGEST_TABLE // (n * (n + 1) // 2))
+    return None if patterns is None else BatchedExact(controller, preview, admissible, patterns)

@@ -1,0 +1,88 @@
+"""What stands between decided and real inputs: valves that stick, slip and have play.
+
+With f_S = (band + jump) / 2 the static and f_D = (band - jump) / 2 the kinetic friction, a stem stays where it is while
+the force e that has built up since, e+ = e + du, is within f_S; beyond it the stem slips to u - f_D sign(e), and
+e = f_D sign(e) is left.
+
+Source: He, Wang, Pottmann, Qin: A curve fitting method for detecting valve stiction in oscillating control loops,
+Industrial & Engineering Chemistry Research 46 (2007). The two parameters are those of Choudhury, Thornhill, Shah:
+Modelling valve stiction, Control Engineering Practice 13 (2005): S = band, J = jump.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_array, as_vector
+from mampc.base.errors import MampcError, shown
+
+
+@dataclass(frozen=True, kw_only=True)
+class Valves:
+    """Actuators with dead-band and stiction, in input units, each a number or one per input.
+
+    Args:
+        band: by how much the decided input has to come back before the actuator follows (dead-band and
+            stickband together); 0 for an actuator that follows at once.
+        jump: by how much it slips when it starts, at most `band`; an actuator that has stopped does not
+            follow a smaller change. 0 for play alone.
+
+    Raises:
+        MampcError: negative numbers, or a jump above the band.
+    """
+
+    band: Any = 0.0
+    jump: Any = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("band", "jump"):
+            given = as_array(name, getattr(self, name))
+            if given.ndim > 1 or not (np.isfinite(given).all() and (given >= 0).all()):
+                raise MampcError(
+                    f"{name}: expected one number of at least 0 or one per input, received "
+                    f"{shown(getattr(self, name))}"
+                )
+            object.__setattr__(self, name, tuple(given.tolist()) if given.ndim else float(given))
+        band, jump = np.asarray(self.band), np.asarray(self.jump)
+        if band.ndim and jump.ndim and band.shape != jump.shape:
+            raise MampcError(f"jump: expected as many values as band, {len(band)}, received {len(jump)}")
+        if (jump > band).any():
+            raise MampcError(f"jump: expected at most the band of {self.band}, received {self.jump}")
+
+    def initial(self, u: Any) -> Stems:
+        """The actuators at rest at the inputs u, shape (..., m)."""
+        u = as_array("u", u)
+        band, jump = (as_vector(name, getattr(self, name), u.shape[-1]) for name in ("band", "jump"))
+        return Stems((band + jump) / 2, (band - jump) / 2, u, np.zeros_like(u), u)
+
+
+@dataclass(frozen=True, eq=False)
+class Stems:
+    """Where actuators are.
+
+    Attributes:
+        static, kinetic: friction, shape (m,).
+        position: shape (..., m), as is what follows.
+        force: that has built up while they stay.
+        decided: the last inputs.
+    """
+
+    static: Array
+    kinetic: Array
+    position: Array
+    force: Array
+    decided: Array
+
+    def moved(self, u: Array) -> Stems:
+        """After the inputs u, shape (..., m), were decided."""
+        force = self.force + (u - self.decided)
+        slips, left = np.abs(force) > self.static, self.kinetic * np.sign(force)
+        return replace(
+            self,
+            position=np.where(slips, u - left, self.position),
+            force=np.where(slips, left, force),
+            decided=u,
+        )
