@@ -3,7 +3,7 @@
 See README.md for ten lines that run, docs/ for the rest.
 """
 
-from mampc import plants
+from mampc import plants, rivals
 from mampc.base.errors import MampcError, StudyError
 from mampc.base.names import Names
 from mampc.base.words import Fault, Remark, Status
@@ -86,6 +86,7 @@ __all__ = [
     "prbs",
     "read_export",
     "replay",
+    "rivals",
     "simulate",
     "simulate_batch",
     "steps",

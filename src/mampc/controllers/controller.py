@@ -35,17 +35,25 @@ class Controller(ABC):
     Args:
         problem: what to track, over which horizons, at what weights and within what limits.
         time_limit: seconds that a sample may take, up to which an answer has to be there; None for no limit.
+        condensed: the condensed problem, where another controller has it already.
     """
 
-    _starts_inside = False  # whether plans start from inputs inside their limits, or are to lead there
+    starts_inside = False  # whether plans start from inputs inside their limits, or are to lead there
 
     def __init__(
-        self, problem: TrackingProblem, *, time_limit: float | None = None, bound_every_move: bool = False
+        self,
+        problem: TrackingProblem,
+        *,
+        time_limit: float | None = None,
+        bound_every_move: bool = False,
+        condensed: CondensedQP | None = None,
     ) -> None:
         if not isinstance(problem, TrackingProblem):
             raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
         self.problem = problem
-        self.condensed = CondensedQP(problem, bound_every_move=bound_every_move)
+        if condensed is None:
+            condensed = CondensedQP(problem, bound_every_move=bound_every_move)
+        self.condensed = condensed
         if time_limit is not None:
             time_limit = as_number("time_limit", time_limit, 0.0, exclusive=True)
         self._time_limit = time_limit
@@ -176,15 +184,15 @@ class Controller(ABC):
     def _plan_from(self, state: ControllerState, sample: Sample, limits: UsualLimits | LimitsNow) -> Plan:
         """The plan for a sample, with the way back of inputs that are outside their limits."""
         inputs, applied = limits.inputs, state.inputs[-1]
-        if not self._starts_inside or inputs.holds(applied):
-            plan = self._plan(sample, state)
+        if not self.starts_inside or inputs.holds(applied):
+            plan = self.plan(sample, state)
             if plan.status is not Status.HELD_INFEASIBLE:
                 return plan
             if inputs.holds(applied):
                 # Where holding keeps the limits nothing is infeasible, and it was the numbers that failed.
                 return plan._replace(status=Status.HELD_SOLVER_FAILED) if self._may_hold(sample) else plan
         back = way_back(state, sample, limits, self.condensed)
-        return back.joined(self._plan(back.sample, back.state))
+        return back.joined(self.plan(back.sample, back.state))
 
     def _may_hold(self, sample: Sample) -> bool:
         """Whether no move at all keeps the limits of inputs and moves."""
@@ -200,7 +208,7 @@ class Controller(ABC):
         return 0.0
 
     @abstractmethod
-    def _plan(self, sample: Sample, state: ControllerState) -> Plan:
+    def plan(self, sample: Sample, state: ControllerState) -> Plan:
         """Search the moves for one sample's data."""
 
     def _completed(
@@ -259,7 +267,7 @@ class Controller(ABC):
             array.setflags(write=False)
         return Decision(
             u, planned, changes, plan.status, objective, lower_bound, plan.iterations, perf_counter() - start,
-            ControllerState(history, state.samples + 1, plan.guess, plan.active), plan.remarks, violations,
+            ControllerState(history, state.samples + 1, plan.guess, plan.active, plan.memory), plan.remarks, violations,
         )  # fmt: skip
 
     def _unrestricted(self, sample: Sample, state: ControllerState) -> Plan:

@@ -23,12 +23,14 @@ class ControllerState:
         guess: a method's starting point for the next sample, shape (nc, m), or None.
         active: bounds that held the last plan of plain MPC, where the solver starts next, shape (n_bounds,), or
             None. It is kept here and not in the solver so that equal states lead to equal decisions, to the bit.
+        memory: what a rule of `mampc.rivals` remembers, one vector, or None.
     """
 
     inputs: Array
     samples: int = 0
     guess: Array | None = None
     active: Array | None = None
+    memory: Array | None = None
 
 
 class Decision(NamedTuple):

@@ -41,7 +41,7 @@ class MAMPC(Controller):
         MampcError: an unknown method or setting, or rules that do not fit the problem.
     """
 
-    _starts_inside = True  # a pattern says which inputs move, so none may be outside when it is chosen
+    starts_inside = True  # a pattern says which inputs move, so none may be outside when it is chosen
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class MAMPC(Controller):
     def _charge(self, moves: Array) -> float:
         return self._admissible.charge(np.abs(moves) > SAME)
 
-    def _plan(self, sample: Sample, state: ControllerState) -> Plan:
+    def plan(self, sample: Sample, state: ControllerState) -> Plan:
         search = self._search
         if search is None:
             return self._unrestricted(sample, state)

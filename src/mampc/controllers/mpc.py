@@ -21,5 +21,5 @@ class MPC(Controller):
         'optimal'
     """
 
-    def _plan(self, sample: Sample, state: ControllerState) -> Plan:
+    def plan(self, sample: Sample, state: ControllerState) -> Plan:
         return self._unrestricted(sample, state)

@@ -38,6 +38,7 @@ class Plan(NamedTuple):
     objective: float | None = None
     remarks: tuple[Remark, ...] = ()
     active: Array | None = None
+    memory: Array | None = None
     violations: Array | None = None
 
 

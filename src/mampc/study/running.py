@@ -24,6 +24,7 @@ from mampc.moves.rules import MoveRules
 from mampc.plants import Plant
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.rivals.registry import RIVALS, rival
 from mampc.study.plugins import make_plant
 from mampc.study.schema import (
     ControllerTable,
@@ -216,20 +217,23 @@ def _record(plant: Plant, u_op: Array, v_op: Array, table: IdentificationTable, 
 
 
 def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
-    if table.method == "mpc":
-        return MPC(problem)
-    assert table.rules is not None
     try:
-        return MAMPC(
-            problem,
-            MoveRules(**table.rules.model_dump()),
-            method=table.method,
-            on_limit_violation=table.on_limit_violation,
-            violation_margin=table.violation_margin,
-            **table.settings,
+        if table.method in RIVALS:
+            around = None if table.around == "mpc" else _sparse(problem, table, table.around, {})
+            return rival(table.method, problem, table.settings, around=around)
+        return (
+            MPC(problem) if table.method == "mpc" else _sparse(problem, table, table.method, table.settings)
         )
     except MampcError as error:
         raise StudyError(f"controllers, {table.name!r}: {error}") from None
+
+
+def _sparse(problem: TrackingProblem, table: ControllerTable, method: str, settings: dict[str, Any]) -> MAMPC:
+    assert table.rules is not None
+    return MAMPC(
+        problem, MoveRules(**table.rules.model_dump()), method=method,
+        on_limit_violation=table.on_limit_violation, violation_margin=table.violation_margin, **settings,
+    )  # fmt: skip
 
 
 def _estimator(study: Study, model: StateSpace) -> KalmanFilter:

@@ -22,6 +22,7 @@ from mampc.methods.registry import METHODS, method_of
 from mampc.moves.rules import MoveRules
 from mampc.plants import QuadrupleTank, SolidOxideFuelCell
 from mampc.program.problem import LONGEST_HORIZON
+from mampc.rivals.registry import RIVALS, RULES, check_settings
 
 PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank, "sofc": SolidOxideFuelCell}
 PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
@@ -173,24 +174,45 @@ class ControllerTable(Table):
     method: Word
     rules: RulesTable | None = None
     settings: dict[str, Any] = {}
+    around: Word = "mpc"
     on_limit_violation: Literal["keep_budget", "ignore_budget"] = "keep_budget"
     violation_margin: Values = 0.0
     published: PublishedTable | None = None
 
     @model_validator(mode="after")
     def _rules_where_needed(self) -> ControllerTable:
+        if self.method in RIVALS:
+            return self._as_rival()
+        if self.around != "mpc":
+            raise ValueError(
+                f"around with the rules {', '.join(RULES)} only; received the method {self.method!r}"
+            )
         if self.method == "mpc":
             if self.rules is not None or self.settings:
                 raise ValueError("neither rules nor settings for the method 'mpc', which has none")
             return self
         if self.method not in METHODS:
-            raise ValueError(f"a method, one of {', '.join(('mpc', *METHODS))}; received {self.method!r}")
+            known = ", ".join(("mpc", *METHODS, *RIVALS))
+            raise ValueError(f"a method, one of {known}; received {self.method!r}")
         if self.rules is None:
             raise ValueError(f"rules for the method {self.method!r}, such as rules = {{ max_moves = 3 }}")
         try:
             method_of(self.method, self.settings)
         except MampcError as error:
             raise ValueError(f"other settings: {error}") from None
+        return self
+
+    def _as_rival(self) -> ControllerTable:
+        try:
+            check_settings(self.method, self.settings)
+        except MampcError as error:
+            raise ValueError(f"other settings: {error}") from None
+        if self.around != "mpc" and (self.method not in RULES or self.around not in METHODS):
+            raise ValueError(
+                f"around one of {', '.join(('mpc', *METHODS))}, with {', '.join(RULES)} only; received {self.around!r}"
+            )
+        if (self.rules is None) != (self.around == "mpc"):
+            raise ValueError("rules for what a rule is put around, if that is not 'mpc'")
         return self
 
 

@@ -1,0 +1,91 @@
+"""Steady targets: the state and inputs at which a model rests with its outputs at a reference.
+
+    minimise   |r - y_s|^2_Q + rho |(u_s - u_op) / s|^2
+    subject to x_s = A x_s + B (u_s + d_u - u_op) + B^v (v - v_op),   u_min <= u_s <= u_max
+               y_s = y_op + C x_s + D (u_s + d_u - u_op) + D^v (v - v_op) + d_y
+
+rho is so small that it decides only where the reference leaves the inputs free. s is a unit per input, in which it
+moves the weighted outputs by about 1 over the horizon.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import null_space
+
+from mampc.base.checks import Array
+from mampc.program.daqp import DaqpSolver
+from mampc.program.parameter import Parameter
+from mampc.program.problem import TrackingProblem
+from mampc.program.qp import UNBOUNDED, QuadraticProgram
+from mampc.program.tail import square_root
+
+NEAREST = 1e-8  # rho
+INTEGRATES = 1e-9  # singular values of [I - A, -B] below it, relative to the largest, are zero
+
+
+class Steady(NamedTuple):
+    """A steady state x (n,) (a deviation) and inputs u (m,) and outputs y (l,) in engineering units."""
+
+    x: Array
+    u: Array
+    y: Array
+
+
+class SteadyTarget:
+    """Finds the steady target of a problem's model; one small program a change of reference or disturbance."""
+
+    def __init__(self, problem: TrackingProblem, parameter: Parameter) -> None:
+        self._problem, self._parameter = problem, parameter
+        model = problem.model
+        n, m, l = model.n_states, model.n_inputs, model.n_outputs
+        B, D = model.B[:, :m], model.D[:, :m]
+        response = model.step_response(problem.prediction_horizon + 1)[:, :, :m]
+        root = square_root(problem.output_weight)
+        gain = np.abs(root @ response).max(axis=(0, 1))
+        self._unit = 1 / np.where(gain > 0, gain, 1.0)
+        # Everything steady is a particular solution plus a combination of these columns.
+        dynamics = np.hstack([np.eye(n) - model.A, -B * self._unit])
+        self._steady = null_space(dynamics, rcond=INTEGRATES)
+        self._particular = np.linalg.pinv(dynamics, rcond=INTEGRATES)
+        self._outputs = root @ np.hstack([model.C, D * self._unit])
+        self._root = root
+        to_u = self._steady[n:]
+        weighted = self._outputs @ self._steady
+        k = self._steady.shape[1]
+        H = 2 * (weighted.T @ weighted + NEAREST * to_u.T @ to_u)
+        H += NEAREST**2 * max(np.trace(H) / max(k, 1), 1e-300) * np.eye(k)
+        self._solver = DaqpSolver(QuadraticProgram(H, to_u, 0))
+        self._weighted, self._to_u, self._shape = weighted, to_u, (n, l)
+
+    def at(self, p: Array) -> Steady:
+        """The target for the parameter p of a sample; with a previewed reference for its last row."""
+        at, model = self._parameter, self._problem.model
+        n, l = self._shape
+        d_u, v = p[at.input_disturbance], p[at.measured_disturbance] - model.v_op
+        reference = p[-l:]
+        forcing = model.B @ np.concatenate([d_u, v])
+        feed = model.D @ np.concatenate([d_u, v])
+        particular = self._particular @ forcing
+        missing = self._root @ (reference - model.y_op - p[at.output_disturbance] - feed)
+        missing = missing - self._outputs @ particular
+        f = -2 * self._weighted.T @ missing + 2 * NEAREST * self._to_u.T @ particular[n:]
+        limits = self._problem.limits
+        low = np.maximum((limits.u_min - model.u_op) / self._unit - particular[n:], -UNBOUNDED)
+        high = np.minimum((limits.u_max - model.u_op) / self._unit - particular[n:], UNBOUNDED)
+        self._solver.start()
+        solution = self._solver.solve(f, low, high)
+        z = np.zeros(len(f)) if solution.z is None else solution.z
+        both = particular + self._steady @ z
+        x, u = both[:n], model.u_op + self._unit * both[n:]
+        u = np.clip(u, limits.u_min, limits.u_max)
+        y = (
+            model.y_op
+            + model.C @ x
+            + model.D[:, : len(u)] @ (u - model.u_op)
+            + feed
+            + p[at.output_disturbance]
+        )
+        return Steady(x, u, y)

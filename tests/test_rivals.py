@@ -1,0 +1,329 @@
+"""Rivals solve the problems that the literature states, and run like any controller."""
+
+from itertools import product
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import mampc
+from builders import random_model, tank_model, tank_problem
+from mampc import rivals
+
+SIZE = (0.5, 2.0)  # of penalties, per input
+RULES = {
+    "dead_band": lambda c: rivals.DeadBand(c, size=0.5),
+    "any": lambda c: rivals.DeadBand(c, size=0.5, kind="any"),
+    "norm": lambda c: rivals.DeadBand(c, size=0.5, kind="norm"),
+    "rounded": lambda c: rivals.Rounded(c, step=0.5),
+    "hysteresis": lambda c: rivals.Rounded(c, step=0.5, hysteresis=0.25),
+    "periodic": lambda c: rivals.Periodic(c, every=3),
+    "event": lambda c: rivals.EventTriggered(c, threshold=0.2),
+    "self": lambda c: rivals.SelfTriggered(c),
+    "quiet": lambda c: rivals.QuietZone(c, band=0.3),
+}
+OTHERS = {
+    "l1": lambda p: rivals.Penalised(p, penalty=rivals.L1(weight=1.0)),
+    "log_sum": lambda p: rivals.Penalised(p, penalty=rivals.LogSum(weight=1.0)),
+    "lasso": lambda p: rivals.Penalised(p, penalty=rivals.L1(), on="inputs", terminal="riccati"),
+    "sparse": lambda p: rivals.SparseInputs(p, most=1),
+}
+ALL = {**{name: lambda p, r=rule: r(mampc.MPC(p)) for name, rule in RULES.items()}, **OTHERS}
+
+
+def random_problem(seed, **changes):
+    model = random_model(seed, n=3, m=2, l=2)
+    settings = {
+        "prediction_horizon": 8, "control_horizon": 4,
+        "limits": mampc.Limits(u_min=model.u_op - 1, u_max=model.u_op + 1),
+    }  # fmt: skip
+    rng = np.random.default_rng(seed)
+    return (
+        mampc.TrackingProblem(model, **(settings | changes)), rng.standard_normal(3),
+        model.y_op + rng.standard_normal(2), model.u_op + rng.uniform(-1, 1, 2),
+    )  # fmt: skip
+
+
+def convex(problem, x, reference, u, penalty, *, on="moves", u_s=None, extra=None):
+    """The penalised problem as CVXPY states it, from predictions of the model; the optimum's cost."""
+    model, n_p, n_c = problem.model, problem.prediction_horizon, problem.control_horizon
+    m, cost, state = model.n_inputs, 0, x
+    inputs = cp.Variable((n_c, m))
+    for i in range(n_p + 1):
+        now = inputs[min(i, n_c - 1)] - model.u_op
+        cost += cp.sum_squares(reference - model.y_op - model.C @ state)
+        state = state if i == n_p else model.A @ state + model.B @ now
+    moves = [inputs[0] - u, *(inputs[j] - inputs[j - 1] for j in range(1, n_c))]
+    cost += 0.1 * sum(cp.sum_squares(move) for move in moves)
+    z = moves if on == "moves" else [inputs[j] - u_s for j in range(n_c)]
+    cost += penalty(cp.vstack([cp.multiply(1 / np.array(SIZE), part) for part in z]))
+    if extra is not None:
+        cost += extra(state)
+    limits = [
+        inputs >= np.tile(problem.limits.u_min, (n_c, 1)),
+        inputs <= np.tile(problem.limits.u_max, (n_c, 1)),
+    ]
+    program = cp.Problem(cp.Minimize(cost), limits)
+    program.solve(solver=cp.CLARABEL)
+    return program.value, inputs.value
+
+
+PENALTIES = {
+    "l1": (rivals.L1(weight=2.0, size=SIZE), lambda z: 2 * cp.sum(cp.abs(z))),
+    "elastic_net": (
+        rivals.ElasticNet(weight=2.0, size=SIZE, curvature=0.3),
+        lambda z: 2 * (cp.sum(cp.abs(z)) + 0.3 * cp.sum_squares(z)),
+    ),
+    "group_l2": (rivals.GroupL2(weight=2.0, size=SIZE), lambda z: 2 * cp.sum(cp.norm(z, axis=1))),
+    "clot": (
+        rivals.CLOT(weight=2.0, size=SIZE, ratio=0.5),
+        lambda z: 2 * (cp.sum(cp.abs(z)) + 0.5 * cp.norm(cp.vec(z, order="C"))),
+    ),
+}
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", PENALTIES)
+@pytest.mark.parametrize("on", ["moves", "inputs"])
+def test_convex_penalties_reach_the_optimum_of_an_independent_solver(name, on, seed):
+    penalty, stated = PENALTIES[name]
+    problem, x, reference, u = random_problem(seed)
+    controller = rivals.Penalised(problem, penalty=penalty, on=on)
+    decision = controller.step(controller.initial_state(u), x, reference)
+    parameter = controller.condensed.parameter.vector(x, u, reference)
+    u_s = mampc.program.steady.SteadyTarget(problem, controller.condensed.parameter).at(parameter).u
+    optimum, _ = convex(problem, x, reference, u, stated, on=on, u_s=u_s)
+    z = decision.changes if on == "moves" else decision.plan - u_s
+    ours = decision.objective + penalty.value(np.abs(z) / SIZE)
+    assert ours == pytest.approx(optimum, rel=2e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_riccati_weight_is_the_cost_of_going_on_for_ever(seed):
+    """The optimum is that of an independent solver with the terminal cost of the Riccati equation added."""
+    problem, x, reference, u = random_problem(seed)
+    stated = PENALTIES["l1"]
+    controller = rivals.Penalised(problem, penalty=stated[0], on="inputs", terminal="riccati")
+    parameter = controller.condensed.parameter.vector(x, u, reference)
+    steady = mampc.program.steady.SteadyTarget(problem, controller.condensed.parameter).at(parameter)
+    from scipy.linalg import solve_discrete_are
+
+    model = problem.model
+    P = solve_discrete_are(model.A, model.B, model.C.T @ model.C, 0.1 * np.eye(2))
+    optimum, _ = convex(
+        problem, x, reference, u, stated[1], on="inputs", u_s=steady.u,
+        extra=lambda state: cp.quad_form(state - steady.x, cp.psd_wrap(P)),
+    )  # fmt: skip
+    decision = controller.step(controller.initial_state(u), x, reference)
+    state = x
+    for i in range(problem.prediction_horizon):
+        state = model.A @ state + model.B @ (decision.plan[min(i, 3)] - model.u_op)
+    ours = decision.objective + stated[0].value(np.abs(decision.plan - steady.u) / SIZE)
+    assert ours + (state - steady.x) @ P @ (state - steady.x) == pytest.approx(optimum, rel=2e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "penalty", [rivals.SCAD(weight=2.0, size=0.3), rivals.MCP(weight=2.0, size=0.3), rivals.LogSum(weight=1.0)],
+    ids=["scad", "mcp", "log_sum"],
+)  # fmt: skip
+def test_rounds_never_raise_a_concave_objective_and_end_where_it_is_stationary(penalty, seed):
+    problem, x, reference, u = random_problem(seed)
+
+    def objective(rounds):
+        controller = rivals.Penalised(problem, penalty=penalty, rounds=rounds)
+        decision = controller.step(controller.initial_state(u), x, reference)
+        return decision, decision.objective + penalty.value(np.abs(decision.changes) / penalty.size)
+
+    values = [objective(rounds)[1] for rounds in range(1, 8)]
+    assert (np.diff(values) <= 1e-6 * values[0]).all()
+    decision, value = objective(200)
+    rng = np.random.default_rng(seed)
+    low, high = problem.limits.u_min, problem.limits.u_max
+    controller = mampc.MPC(problem)
+    sample = controller.condensed.sample(controller.condensed.parameter.vector(x, u, reference), u)
+    for _ in range(200):  # no small step to other plans within the limits lowers it to first order
+        plan = np.clip(decision.plan + 1e-5 * rng.standard_normal(decision.plan.shape), low, high)
+        changes = np.diff(plan, axis=0, prepend=u[None])
+        near = controller.condensed.cost(sample, changes.ravel()) + penalty.value(
+            np.abs(changes) / penalty.size
+        )
+        assert near >= value - 1e-6 * 1e-2 * abs(value)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_few_inputs_at_each_instant_are_the_best_of_all_patterns(seed):
+    problem, x, reference, u = random_problem(seed, control_horizon=2)
+    controller = rivals.SparseInputs(problem, most=1)
+    decision = controller.step(controller.initial_state(u), x, reference)
+    parameter = controller.condensed.parameter.vector(x, u, reference)
+    u_s = mampc.program.steady.SteadyTarget(problem, controller.condensed.parameter).at(parameter).u
+    condensed = controller.condensed
+    sample = condensed.sample(parameter, u)
+    best = np.inf
+    for pattern in product([(True, False), (False, True)], repeat=2):
+        plan = cp.Variable((2, 2))
+        d = cp.hstack([plan[0] - u, plan[1] - plan[0]])
+        cost = cp.sum_squares(condensed.U @ d - sample.target) + sample.cost
+        rows = [plan >= np.tile(problem.limits.u_min, (2, 1)), plan <= np.tile(problem.limits.u_max, (2, 1))]
+        rows += [plan[j][a] == u_s[a] for j in range(2) for a in range(2) if not pattern[j][a]]
+        program = cp.Problem(cp.Minimize(cost), rows)
+        best = min(best, program.solve(solver=cp.CLARABEL))
+    assert decision.objective == pytest.approx(best, rel=1e-6)
+    assert ((np.abs(decision.plan - u_s) > 1e-9).sum(axis=1) <= 1).all()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_rival_runs_like_any_controller(name):
+    regulator = mampc.Regulator(ALL[name](tank_problem()))
+    run = mampc.simulate(tank_model(), regulator, [34.0, 28.0], steps=60, noise=0.1)
+    assert run.metrics(skip=30).tracking_error < 0.5
+    assert (run.u >= 0).all()
+    assert (run.u <= 100).all()
+    state = regulator.initial_state()
+    for k in range(5):
+        decision = regulator.step(state, run.y_measured[k], [34.0, 28.0])
+        copy = regulator.state_from_json(state.to_json())
+        again = regulator.step(copy, run.y_measured[k], [34.0, 28.0])
+        assert (again.u == decision.u).all()
+        state = decision.state
+    assert regulator.step(state, [np.nan, np.nan], [34.0, 28.0]).u.shape == (2,)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_units_decide_nothing(name):
+    scale = np.array([1e-4, 1e3])
+
+    def inputs(by, name=name):
+        model = tank_model()
+        other = mampc.StateSpace(
+            model.A, model.B / by, model.C, model.D / by, model.dt, model.u_op * by, model.y_op, model.names
+        )
+        problem = tank_problem(
+            other, limits=mampc.Limits(u_min=0.0, u_max=100.0 * by), move_weight=0.1 / by**2
+        )
+        made = {
+            "dead_band": lambda c: rivals.DeadBand(c, size=0.5 * by),
+            "any": lambda c: rivals.DeadBand(c, size=0.5 * by, kind="any"),
+            "norm": lambda c: rivals.DeadBand(c, size=0.5 * by, kind="norm"),
+            "rounded": lambda c: rivals.Rounded(c, step=0.5 * by),
+            "hysteresis": lambda c: rivals.Rounded(c, step=0.5 * by, hysteresis=0.25),
+        }
+        if name in made:
+            controller = made[name](mampc.MPC(problem))
+        elif name in RULES:
+            controller = RULES[name](mampc.MPC(problem))
+        elif name == "sparse":
+            controller = rivals.SparseInputs(problem, most=1)
+        else:
+            penalty = (rivals.LogSum if name == "log_sum" else rivals.L1)(size=by)
+            lasso = {"on": "inputs", "terminal": "riccati"} if name == "lasso" else {}
+            controller = rivals.Penalised(problem, penalty=penalty, **lasso)
+        run = mampc.simulate(other, mampc.Regulator(controller), [34.0, 28.0], steps=25, noise=0.1)
+        return run.u / by
+
+    np.testing.assert_allclose(inputs(scale), inputs(np.ones(2)), rtol=1e-4, atol=1e-3)
+
+
+def test_a_dead_band_moves_by_more_than_its_size_or_not_at_all():
+    problem = tank_problem()
+    run = mampc.simulate(
+        tank_model(),
+        mampc.Regulator(rivals.DeadBand(mampc.MPC(problem), size=1.5)),
+        [34.0, 28.0],
+        steps=80,
+        noise=0.2,
+    )
+    moves = np.abs(np.diff(run.u, axis=0, prepend=run.u_initial[None]))
+    assert (moves[moves > 0] > 1.5).all()
+    assert 0 < (moves > 0).mean() < 0.5
+
+
+def test_rounded_inputs_are_on_the_grid_and_hysteresis_saves_moves():
+    def run(hysteresis):
+        controller = rivals.Rounded(mampc.MPC(tank_problem()), step=0.5, hysteresis=hysteresis)
+        return mampc.simulate(tank_model(), mampc.Regulator(controller), [34.0, 28.0], steps=80, noise=0.2).u
+
+    plain, patient = run(0.0), run(0.4)
+    assert (np.abs(plain / 0.5 - np.round(plain / 0.5)) < 1e-9).all()
+    assert np.count_nonzero(np.diff(patient, axis=0)) < np.count_nonzero(np.diff(plain, axis=0))
+
+
+def test_nothing_happens_without_an_event():
+    """With a perfect model and no noise the outputs follow the plan, as long as its inputs are those applied."""
+    problem = tank_problem(control_horizon=1)
+    regulator = mampc.Regulator(rivals.EventTriggered(mampc.MPC(problem), threshold=1e-6))
+    run = mampc.simulate(tank_model(), regulator, [34.0, 28.0], steps=11)
+    assert np.count_nonzero(np.diff(run.u, axis=0).any(axis=1)) <= 1  # the end of the horizon
+
+
+@pytest.mark.parametrize("given", [{"size": -1.0}, {"size": 1.0, "kind": "some"}])
+def test_wrong_settings_are_refused(given):
+    with pytest.raises(mampc.MampcError, match="expected"):
+        rivals.DeadBand(mampc.MPC(tank_problem()), **given)
+
+
+def test_a_rule_needs_a_controller():
+    with pytest.raises(mampc.MampcError, match="expected one such as"):
+        rivals.Periodic(tank_problem(), every=2)
+
+
+def double_integrator():
+    return mampc.StateSpace([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]], None, 1.0)
+
+
+UNIT = mampc.Limits(u_min=-1.0, u_max=1.0)
+
+
+def fewest(model, x0, steps, on):
+    """The l0 optimum by trying all supports, smallest first."""
+    n_moves = steps
+    for count in range(n_moves + 1):
+        for chosen in product([0, 1], repeat=n_moves):
+            if sum(chosen) != count:
+                continue
+            u = cp.Variable(steps)
+            z = u if on == "inputs" else cp.hstack([u[0], cp.diff(u)])
+            x = x0
+            for k in range(steps):
+                x = model.A @ x + model.B[:, 0] * u[k]
+            rows = [x == 0, cp.abs(u) <= 1, *(z[k] == 0 for k in range(steps) if not chosen[k])]
+            program = cp.Problem(cp.Minimize(0), rows)
+            program.solve(solver=cp.CLARABEL)
+            if program.status == "optimal":
+                return count
+    return None
+
+
+@pytest.mark.parametrize(("x0", "steps"), [((2.0, 0.0), 5), ((-1.0, 0.5), 4)])
+def test_exact_counts_are_those_of_all_supports(x0, steps):
+    model, x0 = double_integrator(), np.array(x0)
+    off = mampc.rivals.hands_off(model, x0, steps=steps, limits=UNIT, norm="l0")
+    few = mampc.rivals.minimum_attention(model, x0, steps=steps, limits=UNIT, norm="l0")
+    assert off.nonzero == fewest(model, x0, steps, "inputs")
+    assert few.nonzero == fewest(model, x0, steps, "moves")
+    for plan in (off, few):
+        np.testing.assert_allclose(plan.x[-1], 0.0, atol=1e-6)
+
+
+def test_l1_and_l0_agree_on_the_double_integrator():
+    """Maximum hands-off on a normal plant: the l1 optimum is bang-off-bang and as sparse as can be."""
+    model = double_integrator()
+    l1 = mampc.rivals.hands_off(model, [12.0, 0.0], steps=14, limits=UNIT)
+    l0 = mampc.rivals.hands_off(model, [12.0, 0.0], steps=14, limits=UNIT, norm="l0")
+    assert l1.nonzero == l0.nonzero
+    assert l1.norm <= l0.norm + 1e-9
+    assert l1.u[l1.nonzero // 2 : -(l1.nonzero // 2)] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("pole", "sample"), [(0.8, -1), (1.25, 0)])
+def test_one_input_acts_where_it_reaches_furthest(pole, sample):
+    model = mampc.StateSpace([[pole]], [[1.0]], [[1.0]], None, 1.0)
+    plan = mampc.rivals.hands_off(model, [1.0], steps=6)
+    assert plan.nonzero == 1
+    assert plan.u[sample, 0] == pytest.approx(-(pole**6) / pole ** (5 - sample % 6))
+
+
+def test_a_target_out_of_reach_is_refused():
+    with pytest.raises(mampc.MampcError, match="reached in 3 samples"):
+        mampc.rivals.hands_off(double_integrator(), [100.0, 0.0], steps=3, limits=UNIT)
