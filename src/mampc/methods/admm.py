@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
-from mampc.methods.heuristic import Heuristic, HeuristicSearch
+from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals
 from mampc.methods.splitting import FirstStep
 from mampc.moves.admissible import Allowance
-from mampc.moves.pattern_solver import Incumbent
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.qp import QPStatus
@@ -63,9 +62,7 @@ class ADMMSearch(HeuristicSearch):
             (settings.starts, condensed.n_moves)
         )
 
-    def _propose(
-        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
-    ) -> tuple[int, Array | None]:
+    def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         first_step, mu = self._first_step, self._first_step.mu
         data, unlimited = first_step.begin(sample), sample.moves
         starts = [np.zeros(len(unlimited)), unlimited] + ([guess] if guess is not None else [])
@@ -77,15 +74,12 @@ class ADMMSearch(HeuristicSearch):
                 rounds += 1
                 d, _, solved = first_step.minimise(data, v - w)
                 if solved is not QPStatus.OPTIMAL:
-                    best.failure = solved
-                    return rounds, moves
+                    return Ended(rounds, moves, solved)
                 pattern = self.admissible.select(mu * (d + w) ** 2, allowance)
                 v = (d + w) * pattern
                 w = w + d - v
             if pattern.tobytes() not in proposed:
                 proposed.add(pattern.tobytes())
-                before = best.objective
-                self._solver.offer(sample, pattern, best)
-                if best.objective < before:
+                if (yield pattern).moves is not None:  # better than all before
                     moves = v
-        return rounds, moves
+        return Ended(rounds, moves)

@@ -23,11 +23,10 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_flag, as_number, as_whole
 from mampc.base.words import Status
-from mampc.methods.heuristic import Heuristic, HeuristicSearch
-from mampc.methods.method import HELD_BY, Plan
+from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, proposing
+from mampc.methods.method import Plan
 from mampc.methods.splitting import FirstStep, alternate
 from mampc.moves.admissible import Allowance
-from mampc.moves.pattern_solver import Incumbent
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.qp import QPStatus
@@ -89,25 +88,27 @@ class AlternatingSearch(HeuristicSearch):
         settled = alternate(
             self._first_step, sample, v, choose, self.settings.tolerance, self.settings.max_iterations
         )
+        status = Status.FEASIBLE if self._polish else Status.SETTLED
         if settled.status is QPStatus.ITERATION_LIMIT:
             status = Status.ITERATION_LIMIT
         elif settled.status is not QPStatus.OPTIMAL:
-            return Plan(None, HELD_BY[settled.status], settled.rounds)
-        else:
-            status = Status.FEASIBLE if self._polish else Status.SETTLED
-        shifted = self._shifted(settled.v)
+            failed = proposing([], Ended(settled.rounds, failure=settled.status))
+            return self._best_of(failed, sample, inputs, allowance)
         if not self._polish and sample.frozen is None:  # a frozen input makes not even a small move
-            return Plan(settled.d, status, settled.rounds, guess=shifted, remarks=self._remarks(allowance))
+            return Plan(
+                settled.d,
+                status,
+                settled.rounds,
+                guess=self._shifted(settled.v),
+                remarks=self._remarks(allowance),
+            )
         pattern = settled.v != 0.0
         if not self.admissible.allows(pattern, allowance):  # past moves compete above, and are done
             pattern = self.admissible.select(
                 np.where(pattern, np.abs(settled.d) + self.admissible.price.max(), 0.0), allowance
             )
-        best = Incumbent()
-        self._solver.offer(sample, pattern, best)
-        return self._certified(
-            self._best(sample, best, allowance, settled.rounds, shifted, status), sample, inputs
-        )
+        proposals = proposing([pattern], Ended(settled.rounds, settled.v))
+        return self._best_of(proposals, sample, inputs, allowance, status)
 
     def _second_step(self, inputs: Array, allowance: Allowance) -> Callable[[Array], BoolArray]:
         """What picks the pattern: the paper's threshold for a budget, its extension for other rules."""

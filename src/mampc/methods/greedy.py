@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mampc.base.checks import Array
-from mampc.methods.heuristic import Heuristic, HeuristicSearch
+from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals
 from mampc.methods.local_search import LocalSearch
 from mampc.moves.admissible import Allowance
-from mampc.moves.pattern_solver import Incumbent
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.sample import Sample
@@ -29,8 +28,6 @@ class GreedySearch(HeuristicSearch):
         super().__init__(settings, condensed, rules)
         self._local = LocalSearch(condensed, self.admissible)
 
-    def _propose(
-        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
-    ) -> tuple[int, Array | None]:
-        self._local.offer(self._solver, sample, self._priced_limits(sample), allowance, best)
-        return best.solved, None
+    def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
+        rounds = yield from self._local.patterns(sample, self._priced_limits(sample), allowance)
+        return Ended(rounds)

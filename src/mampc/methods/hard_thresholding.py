@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
-from mampc.methods.heuristic import Heuristic, HeuristicSearch
+from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals
 from mampc.moves.admissible import Allowance
-from mampc.moves.pattern_solver import Incumbent
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.sample import Sample
@@ -50,9 +49,7 @@ class HardThresholdingSearch(HeuristicSearch):
         self._lipschitz = float(np.linalg.eigvalsh(condensed.H)[-1])
         self._contraction = np.eye(condensed.n_moves) - condensed.H / self._lipschitz
 
-    def _propose(
-        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
-    ) -> tuple[int, Array | None]:
+    def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         L, step = self._lipschitz, -self._priced_limits(sample) / self._lipschitz
         d: Array = sample.moves if guess is None else guess
         pattern, rounds = d != 0, 0
@@ -63,5 +60,5 @@ class HardThresholdingSearch(HeuristicSearch):
             last, d = d, free * pattern
             if np.abs(d - last).max() <= self.settings.tolerance:
                 break
-        self._solver.offer(sample, pattern, best)
-        return rounds, d
+        yield pattern
+        return Ended(rounds, d)

@@ -1,25 +1,33 @@
-"""What the methods without a proof share: they propose patterns, and the best plan on any of these is taken."""
+"""What the methods without a proof share: they propose patterns, and the best plan on any of these is taken.
+
+A method is a generator of patterns. Each `yield` hands one out and gives back the best moves on it, which may help to
+find the next; `HeuristicSearch` alone solves.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from mampc.base.checks import Array, as_flag
+from mampc.base.checks import Array, BoolArray, as_flag
 from mampc.base.tolerances import INSIDE, TIE
 from mampc.base.words import Remark, Status
-from mampc.methods.exact.search import Exact
+from mampc.methods.exact.relaxation import Relaxation
+from mampc.methods.exact.search import Exact, ExactSearch
 from mampc.methods.method import HELD_BY, Plan
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
-from mampc.moves.pattern_solver import Incumbent, PatternSolver
+from mampc.moves.pattern_solver import Incumbent, OnPattern, PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
-from mampc.program.daqp import DaqpSolver
+from mampc.program.qp import QPStatus
 from mampc.program.sample import Sample
 
-CERTIFY_SECONDS = 1.0  # that a certificate may take, per sample
+REFEREE_SECONDS = 1.0  # that a certificate may take, or the question whether there is any plan, per sample
 MOST_PROGRAMS = 100  # on one pattern with least sizes, where only an exact method has to try all signs
 
 
@@ -42,6 +50,24 @@ class Heuristic(ABC):
         """The search for one problem and one set of rules."""
 
 
+class Ended(NamedTuple):
+    """How a search for patterns ended: rounds it took, moves (n_moves,) to start the next sample from, what failed."""
+
+    rounds: int
+    moves: Array | None = None
+    failure: QPStatus | None = None
+
+
+Proposals: TypeAlias = Generator[BoolArray, OnPattern, Ended]
+
+
+def proposing(patterns: Iterable[BoolArray], ended: Ended) -> Proposals:
+    """Proposes these patterns, whatever the moves on them."""
+    for pattern in patterns:  # noqa: UP028 - a generator takes what is sent to it, and other iterators do not
+        yield pattern
+    return ended
+
+
 class HeuristicSearch:
     """A method prepared for one condensed problem: all it adds is `_propose`."""
 
@@ -49,63 +75,75 @@ class HeuristicSearch:
 
     def __init__(self, settings: Heuristic, condensed: CondensedQP, rules: MoveRules) -> None:
         problem = condensed.problem
-        self.condensed, self.rules = condensed, rules
+        self.condensed, self.rules, self._certify = condensed, rules, settings.certify
         self.admissible = AdmissiblePatterns(rules, problem.model.n_inputs, problem.control_horizon)
         self._solver = PatternSolver(condensed, self.admissible, most_programs=MOST_PROGRAMS)
-        self._relaxed: DaqpSolver | None = None
-        self._referee = (
-            Exact(time_limit=CERTIFY_SECONDS).prepare(condensed, rules) if settings.certify else None
-        )
+
+    @cached_property
+    def _referee(self) -> ExactSearch:
+        return Exact(time_limit=REFEREE_SECONDS).prepare(self.condensed, self.rules)
+
+    @cached_property
+    def _relaxation(self) -> Relaxation:
+        return Relaxation(self.condensed)
 
     def plan(self, sample: Sample, inputs: Array, guess: Array | None) -> Plan:
         """The best plan on any proposed pattern."""
-        allowance, best = self.admissible.allowance(inputs, sample.frozen), Incumbent()
-        rounds, found = 0, None
-        if allowance.left:
-            last = None if guess is None else guess.ravel()
-            rounds, found = self._propose(sample, allowance, last, best)
-        return self._certified(
-            self._best(sample, best, allowance, rounds, self._shifted(found)), sample, inputs
-        )
+        allowance = self.admissible.allowance(inputs, sample.frozen)
+        last = None if guess is None else guess.ravel()
+        proposals = self._propose(sample, allowance, last) if allowance.left else proposing((), Ended(0))
+        return self._best_of(proposals, sample, inputs, allowance)
 
-    def _propose(
-        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
-    ) -> tuple[int, Array | None]:
-        """Offer plans to `best`; returns the rounds this took and moves, (n_moves,), to start the next sample from."""
-        return 0, None
+    def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
+        """Patterns worth a try; `guess` are the moves, (n_moves,), that the last sample's search ended with."""
+        raise NotImplementedError
 
-    def _best(
+    def _best_of(
         self,
+        proposals: Proposals,
         sample: Sample,
-        best: Incumbent,
+        inputs: Array,
         allowance: Allowance,
-        rounds: int,
-        guess: Array | None,
         status: Status = Status.FEASIBLE,
     ) -> Plan:
-        """The best plan offered, as an answer; no moves at all is always among them."""
+        """The best plan on the patterns proposed, as an answer; no moves at all is always among them."""
+        best, solved = Incumbent(), None
+        try:
+            while True:
+                pattern = next(proposals) if solved is None else proposals.send(solved)
+                solved = self._solver.offer(sample, pattern, best)
+        except StopIteration as end:
+            ended: Ended = end.value
         best.offer(self._solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
-        remarks = self._remarks(allowance)
-        if best.moves is None:
-            held = Status.HELD_INFEASIBLE if best.failure is None else HELD_BY[best.failure]
-            return Plan(None, held, rounds, guess=guess, remarks=remarks)
-        return Plan(best.moves, status, rounds, guess=guess, objective=best.objective, remarks=remarks)
+        guess, remarks = self._shifted(ended.moves), self._remarks(allowance)
+        if best.moves is not None:
+            plan = Plan(
+                best.moves, status, ended.rounds, guess=guess, objective=best.objective, remarks=remarks
+            )
+            return self._certified(plan, sample, inputs) if self._certify else plan
+        if self._multipliers_of_plain(sample) is not None:
+            # Some moves keep the limits, if perhaps on no pattern: that is for the exact search to say.
+            return self._referee.plan(sample, inputs)._replace(guess=guess)
+        failure = ended.failure or best.failure or QPStatus.INFEASIBLE
+        return Plan(None, HELD_BY[failure], ended.rounds, guess=guess, remarks=remarks)
 
     def _remarks(self, allowance: Allowance) -> tuple[Remark, ...]:
         return (Remark.BUDGET_EXCEEDED,) if allowance.exceeded else ()
+
+    def _multipliers_of_plain(self, sample: Sample) -> Array | None:
+        """The multipliers of the limits, shape (n_bounds,), with every move free; None where nothing keeps these."""
+        self._relaxation.begin()
+        return self._relaxation.of_plain(sample)
 
     def _priced_limits(self, sample: Sample) -> Array:
         """The linear term of the moves, with the limits priced by the multipliers of plain MPC."""
         margins = sample.margins
         if margins[margins.argmin()] > INSIDE:
             return sample.f_moves
-        if self._relaxed is None:
-            self._relaxed = DaqpSolver(self.condensed.program)
-        self._relaxed.start()
-        solution = self._relaxed.solve(sample.f, sample.lower, sample.upper)
-        if solution.multipliers is None:
-            return sample.f_moves
-        return self.condensed.relaxed_limits(sample, solution.multipliers)[0]
+        multipliers = self._multipliers_of_plain(sample)
+        return (
+            sample.f_moves if multipliers is None else self.condensed.relaxed_limits(sample, multipliers)[0]
+        )
 
     def _shifted(self, moves: Array | None) -> Array | None:
         """Moves as they stand one sample later, shape (nc, m)."""
@@ -115,12 +153,10 @@ class HeuristicSearch:
         return np.concatenate([moves[m:], np.zeros(m)]).reshape(-1, m)
 
     def _certified(self, plan: Plan, sample: Sample, inputs: Array) -> Plan:
-        """The plan with a proven lower bound, where that is asked for."""
-        if self._referee is None or plan.objective is None:
-            return plan
+        """The plan with a proven lower bound."""
         proof = self._referee.plan(sample, inputs)
         bound = proof.objective if proof.lower_bound is None else proof.lower_bound
-        if bound is None:
+        if bound is None or plan.objective is None:
             return plan
         if plan.objective - bound <= 10 * TIE * max(1e-6, sample.constant):
             return plan._replace(status=Status.OPTIMAL, lower_bound=None)

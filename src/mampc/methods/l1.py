@@ -15,9 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_whole
-from mampc.methods.heuristic import Heuristic, HeuristicSearch
+from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals, proposing
 from mampc.moves.admissible import Allowance
-from mampc.moves.pattern_solver import Incumbent
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.daqp import DaqpSolver
@@ -72,9 +71,7 @@ class L1Search(HeuristicSearch):
         # Next to that little curvature of t moves are small numbers.
         self._program = DaqpSolver(QuadraticProgram(H, A, full.n_simple), tolerance=1e-9 * np.sqrt(CURVATURE))
 
-    def _propose(
-        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
-    ) -> tuple[int, Array | None]:
+    def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         proposed: dict[bytes, BoolArray] = {}
         largest, rounds = np.abs(sample.moves).max(), 0
         c = np.ones(self.condensed.n_moves)
@@ -84,9 +81,7 @@ class L1Search(HeuristicSearch):
             rounds += programs
             c = 1 / (np.abs(d) + 0.1 * largest + 1e-300)
             c /= c.max()
-        for pattern in proposed.values():
-            self._solver.offer(sample, pattern, best)
-        return rounds, None
+        return (yield from proposing(proposed.values(), Ended(rounds)))
 
     def _weighed(
         self, sample: Sample, allowance: Allowance, c: Array, zero: float, proposed: dict[bytes, BoolArray]

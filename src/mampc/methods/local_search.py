@@ -11,12 +11,15 @@ so that all exchanges of one move for another are priced at once.
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import suppress
+
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.moves.exchanges import PatternNeighbours
-from mampc.moves.pattern_solver import Incumbent, PatternSolver
+from mampc.moves.pattern_solver import Incumbent, OnPattern, PatternSolver
 from mampc.program.condensing import CondensedQP
 from mampc.program.sample import Sample
 
@@ -90,20 +93,30 @@ class LocalSearch:
         best: Incumbent,
         deadline: float = np.inf,
     ) -> None:
-        """Offer the plans of a local search to the incumbent; multipliers of one round price limits in the next.
+        """Offer the plans of a local search, as `patterns` proposes them, to the incumbent."""
+        patterns, solved = self.patterns(sample, f, past), None
+        with suppress(StopIteration):
+            while True:
+                pattern = next(patterns) if solved is None else patterns.send(solved)
+                solved = solver.offer(sample, pattern, best, deadline)
 
-        The first round takes the linear term f, shape (n_moves,): best with limits priced in that plain MPC runs into.
+    def patterns(self, sample: Sample, f: Array, past: Allowance) -> Generator[BoolArray, OnPattern, int]:
+        """Patterns, each from the last, whose multipliers price the limits in; is sent the best moves on each.
+
+        The first takes the linear term f, shape (n_moves,): best with limits priced in that plain MPC runs into.
+        Returns how many there were.
         """
         least_gain = LEAST_GAIN * sample.constant
         pattern = self.forward(f, past)
         for number in range(ROUNDS):
             last, pattern = pattern, self.exchange(f, past, pattern, least_gain)
             if number and (pattern == last).all():
-                break
-            solved = solver.offer(sample, pattern, best, deadline)
+                return number
+            solved = yield pattern
             if solved.multipliers is None or not solved.multipliers.any():
-                break
+                return number + 1
             f, _ = self.condensed.relaxed_limits(sample, solved.multipliers)
+        return ROUNDS
 
     def _gain(self, r: Array, q: Array) -> Array:
         """What a move gains, given its gradient and curvature, when it has at least its least size."""

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
-from mampc.methods.heuristic import Heuristic, HeuristicSearch
+from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals
 from mampc.methods.splitting import FirstStep, alternate
 from mampc.moves.admissible import Allowance
-from mampc.moves.pattern_solver import Incumbent
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.qp import QPStatus
@@ -63,9 +62,7 @@ class PenaltyDecompositionSearch(HeuristicSearch):
         self._first_steps = [FirstStep(condensed, self._mu)]
         self._largest_mu = 0.25 * LARGEST_CONDITION * float(np.linalg.eigvalsh(condensed.program.H)[0])
 
-    def _propose(
-        self, sample: Sample, allowance: Allowance, guess: Array | None, best: Incumbent
-    ) -> tuple[int, Array | None]:
+    def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         settings, rounds = self.settings, 0
         v: Array = np.zeros(self.condensed.n_moves) if guess is None else guess
         for number in range(MOST_GROWTHS):
@@ -82,10 +79,9 @@ class PenaltyDecompositionSearch(HeuristicSearch):
             rounds += inner.rounds
             # Not settled by its last round, the alternation goes on with the next mu.
             if inner.status not in (QPStatus.OPTIMAL, QPStatus.ITERATION_LIMIT):
-                best.failure = inner.status
-                return rounds, None
+                return Ended(rounds, failure=inner.status)
             v = inner.v
             if np.abs(inner.d - v).max() <= settings.tolerance:
                 break
-        self._solver.offer(sample, v != 0, best)
-        return rounds, v
+        yield v != 0
+        return Ended(rounds, v)
