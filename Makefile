@@ -70,10 +70,10 @@ clean:  ## remove environments and caches
 
 .venv/run.stamp: .venv/pyvenv.cfg pyproject.toml requirements.lock
 	@echo "Installing what a run needs ..."
-	@$(UV) pip install --quiet --constraint requirements.lock --editable '.[plot]'
+	@$(UV) pip install --quiet --constraint requirements.lock --editable '.[plot,report]'
 	@touch $@
 
 .venv/dev.stamp: .venv/pyvenv.cfg pyproject.toml requirements.lock
 	@echo "Installing what tests and linters need ..."
-	@$(UV) pip install --quiet --requirement requirements.lock --editable '.[plot]'
+	@$(UV) pip install --quiet --requirement requirements.lock --editable '.[plot,report]'
 	@touch $@ .venv/run.stamp

@@ -13,7 +13,6 @@ from mampc.study import load_study, run_study
 
 IMAGES = Path(__file__).parent / "images"
 SHOWN = {"noisy_overview", "noisy_moves-against-error"}
-SAMPLE = 7  # of the pattern shown: moves behind, now and ahead
 PALE = "#dce9f2"
 
 
@@ -34,10 +33,20 @@ def save(name, figure):
 
 def pattern_figure(result):
     """One decision of the exact budget on the noisy tank: its pattern, and the inputs that come of it."""
-    run, k = result.runs["noisy"]["exact budget"], SAMPLE
+    run = result.runs["noisy"]["exact budget"]
     rules = next(table.rules for table in result.study.controllers if table.name == "exact budget")
-    decision, back = run.decisions[k], rules.sparsity_horizon - 1
-    past = np.abs(np.diff(run.u[k - back - 1 : k], axis=0)) > SAME
+    back = rules.sparsity_horizon - 1
+    made = np.abs(np.diff(run.u, axis=0, prepend=run.u_initial[None])) > SAME
+    # The first decision with a move one sample behind it, one now and one later, none of them noise.
+    k = next(
+        k
+        for k in range(back + 1, len(run.u))
+        if made[k - 1].any()
+        and made[k].any()
+        and np.ptp(run.u[k - 2 : k + 1]) > 1
+        and run.decisions[k].moves[1:].any()
+    )
+    decision, past = run.decisions[k], made[k - back : k]
     ahead = len(decision.moves)
     moved = np.vstack([past, decision.moves])
     with styled():

@@ -187,7 +187,7 @@ def test_the_summary_holds_what_is_promised(result):
 
 def test_the_files_of_a_run_can_be_read_back(tmp_path):
     result, summary, missing = run_and_write(parse_study(SHORT), tmp_path / "out")
-    assert missing is None
+    assert missing == ()
     assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
     model = mampc.StateSpace.load(tmp_path / "out" / "model.json")
     np.testing.assert_array_equal(model.A, result.model.A)
@@ -254,7 +254,7 @@ def test_a_study_that_does_not_fit_leaves_the_last_results_alone(tmp_path):
 def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
     text = SHORT.replace('name = "MPC"', r"name = 'a [/b] $\foo{$'")
     outcome, summary, missing = run_and_write(parse_study(text), tmp_path / "out")
-    assert missing is None
+    assert missing == ()
     console = Console(width=200, file=io.StringIO())
     for table in comparison_tables(outcome.study, summary):
         console.print(table)

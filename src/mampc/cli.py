@@ -61,7 +61,8 @@ def run(
 ) -> None:
     """Run a study: identify a model, close the loop with every controller, compare.
 
-    Prints a table and writes summary.json, a CSV of every trajectory, the model and figures (PNG, SVG).
+    Prints a table and writes summary.json, a CSV of every trajectory, the model, figures (PNG, SVG) and
+    report.html, one page to send on: it needs no other file and no network.
 
     Examples:
 
@@ -85,8 +86,8 @@ def run(
         console.print()
     for warning in result.warnings:
         _complain(f"warning: {warning}")
-    if missing is not None:
-        _complain(f"note: no figures written; {missing}")
+    for note in missing:
+        _complain(f"note: {note}")
     console.print(f"Results are in {directory}", soft_wrap=True, markup=False)
 
 
@@ -309,7 +310,7 @@ def _progress() -> Iterator[Any]:
     """A function that shows the current stage: a spinner on a terminal, a line each elsewhere."""
     console = Console(stderr=True, highlight=False, markup=False)
     if not console.is_terminal:
-        yield lambda stage: None if stage.startswith("figure") else _complain(f"{stage} ...")
+        yield lambda stage: None if stage.startswith(("figure", "report.html")) else _complain(f"{stage} ...")
         return
     with console.status("") as status:
         yield lambda stage: status.update(f"{stage} ...")

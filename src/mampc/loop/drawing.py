@@ -14,7 +14,6 @@ from mampc.base.errors import MampcError
 from mampc.base.names import Names
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Okabe and Ito's palette: told apart by the colour-blind and in print.
@@ -132,33 +131,43 @@ def signals_figure(
                     first.t / scale, first.r[:, i], where="post", color=BLACK, linestyle=(0, (4, 2)),
                     linewidth=0.9, zorder=4.2, label="reference",
                 )  # fmt: skip
-            told = _draw_limits(panel, limits, "y" if output else "u", i)
+            near, told = near_limits(limits, output, i, *panel.get_ylim())
+            for limit in near:
+                panel.axhline(
+                    limit, color=BLACK, linewidth=0.9, linestyle=(0, (1, 1.5)), label="limit", zorder=4.1
+                )
             panel.set_title(plain(names.with_unit(name) + told))
         axes[-1, 0].set_xlabel(f"time ({unit})")
-        axes[-1, 0].set_xlim(0, float(first.t[-1]) / scale)
+        axes[-1, 0].set_xlim(0, float(first.t[-1]) / scale or None)
         legend_above(figure)
     return figure
 
 
-def _draw_limits(panel: Axes, limits: Any, letter: str, i: int) -> str:
-    """Draw the limits of a signal that lie near its data; returns what is to be said of the others."""
-    low, high = panel.get_ylim()
-    far = {}
+def near_limits(limits: Any, output: bool, i: int, low: float, high: float) -> tuple[list[float], str]:
+    """The limits of a signal that lie near its range low..high, and what is to be said of the others.
+
+    Args:
+        limits: what has fields u_min, u_max, y_min and y_max, or None.
+        output: whether the signal is an output.
+        i: which output or input.
+        low, high: the range of the data shown.
+    """
+    near, far = [], {}
     for side in ("min", "max"):
-        given = getattr(limits, f"{letter}_{side}", None)
+        given = getattr(limits, f"{'y' if output else 'u'}_{side}", None)
         values = np.ravel(np.inf if given is None else given)
         limit = float(values[i] if len(values) > 1 else values[0])
         if not np.isfinite(limit):
             continue
         if abs(limit - (low + high) / 2) <= high - low:
-            panel.axhline(
-                limit, color=BLACK, linewidth=0.9, linestyle=(0, (1, 1.5)), label="limit", zorder=4.1
-            )
+            near.append(limit)
         else:
             far[side] = f"{limit:g}"
     if len(far) == 2:
-        return f", limits {far['min']} to {far['max']}"
-    return "".join(f", {'at least' if side == 'min' else 'at most'} {limit}" for side, limit in far.items())
+        return near, f", limits {far['min']} to {far['max']}"
+    return near, "".join(
+        f", {'at least' if side == 'min' else 'at most'} {limit}" for side, limit in far.items()
+    )
 
 
 def time_scale(time: Array) -> tuple[float, str]:

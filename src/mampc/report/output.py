@@ -13,12 +13,14 @@ from mampc.loop.drawing import styled
 from mampc.loop.run import Run
 from mampc.report.figures import study_figures
 from mampc.report.folder import ResultFolder
+from mampc.report.interactive import interactive_page
 from mampc.report.summary import summarise
 from mampc.study import Study, StudyResult, run_study
 from mampc.study.running import Prepared
 from mampc.study.schema import file_word
 
 SUMMARY = "summary.json"
+PAGE = "report.html"
 FIGURE_KINDS = ("png", "svg")
 
 
@@ -51,6 +53,12 @@ class StudyFiles:
         save_figure(figure, self._folder.path / stem)
         return f"{stem}.svg"
 
+    def page(self, result: StudyResult) -> None:
+        """report.html, which needs no other file; `MampcError` where plotly is missing."""
+        text = interactive_page(result)
+        with self._folder.writing(f"{self._prefix}{PAGE}") as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
+
     def summary(self, result: StudyResult) -> dict[str, Any]:
         """summary.json; returns its content."""
         summary = summarise(result)
@@ -62,11 +70,11 @@ class StudyFiles:
 
 def run_and_write(
     study: Study, directory: Path, on_stage: Callable[[str], None] = lambda stage: None
-) -> tuple[StudyResult, dict[str, Any], str | None]:
+) -> tuple[StudyResult, dict[str, Any], tuple[str, ...]]:
     """Run a study; each trajectory is written when its run has finished, summary.json when all is there.
 
     Returns:
-        The result, the content of summary.json, and why there are no figures, if so.
+        The result, the content of summary.json, and what is not there and why.
 
     Raises:
         MampcError: values of the study that do not fit its plant or model, or a folder that cannot be written.
@@ -79,14 +87,19 @@ def run_and_write(
         files.model(prepared)
 
     result = run_study(study, on_stage, on_begin=begin, on_run=files.trajectory)
-    missing = None
+    missing = []
     try:
         for drawing in study_figures(result):
             on_stage(f"figure {drawing.name}")
             files.figure(drawing.name, drawing.figure)
     except MampcError as error:
-        missing = str(error)
-    return result, files.summary(result), missing
+        missing.append(f"no figures written; {error}")
+    on_stage(PAGE)
+    try:
+        files.page(result)
+    except MampcError as error:
+        missing.append(f"no {PAGE} written; {error}")
+    return result, files.summary(result), tuple(missing)
 
 
 def trajectory_name(scenario: str, controller: str) -> str:

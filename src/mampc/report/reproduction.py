@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mampc.base.errors import MampcError
 from mampc.compare.sweep import SETTINGS, Point, holding, sensitivity
 from mampc.report.figures import sensitivity_figure, study_figures
 from mampc.report.folder import ResultFolder
@@ -86,6 +87,10 @@ def reproduce(directory: Path, on_stage: Callable[[str], None] = lambda stage: N
     for case in cases:
         on_stage(f"{case.study.name}: figures")
         _write_case(page, case, folder)
+        try:
+            StudyFiles(folder, f"{case.study.name}/").page(case.result)
+        except MampcError as error:
+            on_stage(f"no {case.study.name}/report.html written; {error}")
     _judge(page, cases)
     for ending, text in page.texts(directory):
         with folder.writing(f"report.{ending}") as unfinished:
