@@ -130,7 +130,9 @@ def test_of_many_complaints_the_first_are_shown():
 
 def test_a_byte_order_mark_does_not_matter(tmp_path):
     (tmp_path / "study.toml").write_text(template(), encoding="utf-8-sig")
-    assert load_study(tmp_path / "study.toml").model_dump() == parse_study(template()).model_dump()
+    assert load_study(tmp_path / "study.toml").model_dump(exclude={"place"}) == parse_study(
+        template()
+    ).model_dump(exclude={"place"})
 
 
 def test_a_model_file_with_an_impossible_name_is_refused():
