@@ -1,14 +1,18 @@
 """Redraw the figures of the documentation, each from a computation: `make figures`."""
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
 from scipy import signal
+from ugly_export import ugly_export
 
 import mampc
 from mampc.base.tolerances import SAME
+from mampc.identification.export import inspect_export
 from mampc.loop.drawing import BLACK, BLUE, GREY, VERMILION, legend_above, new_figure, styled
 from mampc.report.figures import study_figures
+from mampc.report.inspecting import inspection_figure
 from mampc.study import load_study, run_study
 
 IMAGES = Path(__file__).parent / "images"
@@ -19,11 +23,20 @@ PALE = "#dce9f2"
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     save("procrastination", procrastination_figure())
+    save("export-columns", export_figure())
     result = run_study(load_study("quadruple-tank"), print)
     save("move-pattern", pattern_figure(result))
     for drawing in study_figures(result):
         if drawing.name in SHOWN:
             save(drawing.name, drawing.figure)
+
+
+def export_figure():
+    """The ugly export of docs/data.md, as `mampc inspect` draws it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "export.csv"
+        path.write_bytes(ugly_export().encode("cp1252"))
+        return inspection_figure(inspect_export(path))
 
 
 def save(name, figure):

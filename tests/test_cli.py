@@ -63,6 +63,9 @@ def test_new_writes_a_study_once_and_run_runs_it(tmp_path):
     assert summary["steps"] == 20
 
 
+IDENTIFY_SHORT = ("identify", "short.csv", "--inputs", "u", "--outputs", "y", "--dt", "1")
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -76,6 +79,16 @@ def test_new_writes_a_study_once_and_run_runs_it(tmp_path):
         (("identify", "short.csv", "--inputs", "u", "--outputs", "y", "--dt", "-1"), "dt"),
         (("new", "no-such-folder/study.toml"), "written"),
         (("identify", "short.csv"), "--inputs"),
+        (("identify", "a" * 300, "--inputs", "u", "--outputs", "y"), "too long"),
+        (("identify", "", "--inputs", "u", "--outputs", "y"), "readable"),
+        ((*IDENTIFY_SHORT, "--out", "a" * 300 + ".json"), "mampc:"),
+        (("inspect", "a" * 300), "too long"),
+        (("inspect", "short.csv", "--dt", "1", "--range", "u"), "--range: expected COLUMN=LOW:HIGH"),
+        (("run", "a" * 300), "mampc:"),
+        (("run", "quadruple-tank", "--out", "a" * 300), "mampc:"),
+        (("new", "a" * 300), "mampc:"),
+        (("replay", "a" * 300, "-s", "quadruple-tank"), "mampc:"),
+        (("reproduce", "--out", "a" * 300), "mampc:"),
     ],
 )
 def test_complaints_go_to_standard_error_without_a_traceback(arguments, expected, tmp_path):
@@ -91,7 +104,7 @@ def test_complaints_go_to_standard_error_without_a_traceback(arguments, expected
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-@pytest.mark.parametrize("command", [(), ("run",), ("new",), ("identify",)])
+@pytest.mark.parametrize("command", [(), ("run",), ("new",), ("inspect",), ("identify",)])
 def test_help_shows_how(command, tmp_path):
     done = call(*command, "--help", cwd=tmp_path)
     assert done.returncode == 0
@@ -127,3 +140,71 @@ def test_a_model_that_explains_little_is_warned_of(tmp_path):
     done = call("identify", "noise.csv", "--inputs", "u1", "--outputs", "y1", cwd=tmp_path)
     assert done.returncode == 0
     assert "warning: the model explains less" in done.stderr
+
+
+@pytest.fixture
+def gappy(record, tmp_path):
+    """The record with two marks and a gap, under names with commas."""
+    lines = record.read_text().splitlines()
+    lines[0] = 'time,"valve, left",pump,level,flow'
+    lines[50] = lines[50].rsplit(",", 1)[0] + ",Bad"
+    del lines[90:95]
+    (tmp_path / "gappy.csv").write_text("\n".join(lines))
+    return tmp_path / "gappy.csv"
+
+
+def test_identify_tells_what_it_noticed_and_takes_every_piece(gappy, tmp_path):
+    names = ("--inputs", '"valve, left",pump', "--outputs", "level,flow")
+    done = call("identify", "gappy.csv", *names, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "flow: no number in 1 of" in done.stdout
+    assert "2 gaps in the record" in done.stdout
+    assert "Estimated on 2 pieces of" in done.stdout or "Estimated on 3 pieces of" in done.stdout
+    poles = mampc.StateSpace.load(tmp_path / "gappy.json").poles()
+    np.testing.assert_allclose(np.sort(poles.real), [0.6, 0.8], atol=0.05)
+
+
+def test_identify_takes_several_files(record, gappy, tmp_path):
+    (tmp_path / "other.csv").write_text(gappy.read_text().replace('"valve, left"', "valve"))
+    done = call(
+        "identify", record, "other.csv", "--inputs", "valve,pump", "--outputs", "level,flow", "-o", "m.json",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "other.csv: 2 gaps" in done.stdout
+
+
+def test_a_sample_time_against_the_file_is_refused(record, tmp_path):
+    done = call("identify", record, "--inputs", "valve", "--outputs", "level", "--dt", "1", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "dt: expected 10 s, the step of column 'time', received 1 s" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_inspect_shows_columns_gaps_and_marks_and_draws_them(gappy, tmp_path):
+    done = call("inspect", "gappy.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for words in (
+        "valve, left",
+        "could be an input",
+        "1 gap in the record",
+        "flow: no number in 1 of",
+        "every 10 s",
+    ):
+        assert words in done.stdout
+    assert (tmp_path / "gappy-columns.png").stat().st_size > 10_000
+    assert (tmp_path / "gappy-columns.svg").exists()
+
+
+def test_inspect_tells_what_is_missing_and_what_to_decide(tmp_path):
+    n = 60
+    u = np.where(np.arange(n) % 10 < 5, 1.0, 2.0)
+    rows = [f"{k % 7 + 60 * k},{u[k]},{2 * u[k]},{k > 30:d},{k / 7}" for k in range(n)]
+    rows[7] = rows[7].rsplit(",", 1)[0] + ",12 bar"
+    (tmp_path / "a.csv").write_text("nr,u,v,w,y\n" + "\n".join(rows))
+    done = call("inspect", "a.csv", "--inputs", "u,v,w", "--outputs", "y", "--out", "seen.png", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "u and v move together (correlation of moves 1.00)" in done.stdout
+    assert "w moves 1 time in 60 samples" in done.stdout
+    assert "received '12 bar'" in done.stdout.split("To decide before")[1]
+    assert (tmp_path / "seen.svg").exists()

@@ -1,9 +1,10 @@
-"""The command line: `mampc run`, `replay`, `reproduce`, `new`, `identify`."""
+"""The command line: `mampc run`, `replay`, `reproduce`, `new`, `inspect`, `identify`."""
 
 from __future__ import annotations
 
+import csv
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,15 +24,17 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _NARROW = 125  # columns of a table that is not on a terminal
-POOR_FIT = 40.0  # percent; a model below it is hardly one to control with
 
 
 def main() -> None:
     """Run the command line; complaints go to standard error and exit with 2."""
     try:
         app()
-    except MampcError as error:
-        Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"mampc: {error}")
+    except (MampcError, OSError) as error:  # OSError: such as a name longer than any file's
+        expected = (
+            "" if isinstance(error, MampcError) else "expected a file or folder that can be used, received: "
+        )
+        Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"mampc: {expected}{error}")
         sys.exit(2)
     except KeyboardInterrupt:
         print("mampc: interrupted; what had finished is written", file=sys.stderr)
@@ -177,17 +180,112 @@ def new(path: Annotated[Path, typer.Argument(help="File to write; must not exist
     _console().print(f"Wrote {path}; edit it, then run: mampc run {path}", soft_wrap=True)
 
 
+Inputs = Annotated[str, typer.Option(help="Input columns, separated by commas.")]
+Outputs = Annotated[str, typer.Option(help="Output columns, separated by commas.")]
+Disturbances = Annotated[str, typer.Option(help="Columns of inputs that are measured and not manipulated.")]
+SampleTime = Annotated[
+    float | None, typer.Option("--dt", help="Sample time in seconds, where no column tells it.")
+]
+TimeColumn = Annotated[str | None, typer.Option("--time", help="Column of times; default found.")]
+TimeUnit = Annotated[str | None, typer.Option(help="Of times that are numbers: ms, s, min, h or d.")]
+TimeFormat = Annotated[
+    str | None, typer.Option(help="Of time stamps, as strptime has it, such as '%d/%m/%Y %H:%M'.")
+]
+TimeZone = Annotated[str | None, typer.Option(help="Of local time stamps, such as Europe/Berlin.")]
+Decimal = Annotated[str | None, typer.Option(help="Decimal mark, . or , where it is in doubt.")]
+Bad = Annotated[
+    list[str] | None, typer.Option(help="A further word or number in place of a missing value; repeat it.")
+]
+Good = Annotated[
+    list[str] | None, typer.Option(help="A word of quality columns for a good value; repeat it.")
+]
+Ranges = Annotated[
+    list[str] | None,
+    typer.Option("--range", help="Lowest and highest believable value, COLUMN=LOW:HIGH; repeat it."),
+]
+
+
+@app.command()
+def inspect(
+    export: Annotated[Path, typer.Argument(help="CSV, Excel or Parquet file.")],
+    inputs: Inputs = "",
+    outputs: Outputs = "",
+    disturbances: Disturbances = "",
+    dt: SampleTime = None,
+    time: TimeColumn = None,
+    time_unit: TimeUnit = None,
+    time_format: TimeFormat = None,
+    time_zone: TimeZone = None,
+    decimal: Decimal = None,
+    bad: Bad = None,
+    good: Good = None,
+    ranges: Ranges = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Picture; default NAME-columns.png beside the file.")
+    ] = None,
+) -> None:
+    """Look at an export before anything is identified from it.
+
+    Shows columns, units, span, gaps and bad values, which columns move enough to be inputs, what excitation is
+    missing, and what has to be decided first; draws every column over time (PNG, SVG).
+
+    Examples:
+
+        mampc inspect export.csv
+
+        mampc inspect export.csv --inputs FIC-1.OP --outputs TI-3 --range TI-3=0:200 --out look.png
+    """
+    from mampc.identification.export import inspect_export
+    from mampc.report.inspecting import inspection_figure, inspection_table, inspection_words
+    from mampc.report.output import save_figure
+
+    reading = _reading(
+        inputs, outputs, disturbances, ranges, bad, good, dt=dt,
+        time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
+    )  # fmt: skip
+    target = export.parent / f"{export.stem}-columns.png" if out is None else out
+    with _progress() as show:
+        show("reading the file")
+        seen = inspect_export(export, **reading)
+        missing = None
+        try:
+            if seen.columns:
+                show("drawing its columns")
+                save_figure(inspection_figure(seen), target.with_suffix(""))
+        except MampcError as error:
+            missing = str(error)
+    console = _console()
+    if seen.columns:
+        console.print(inspection_table(seen))
+    for line in inspection_words(seen):
+        console.print(line, soft_wrap=True, markup=False)
+    for title, sentences in (
+        ("Noticed", seen.notes),
+        ("Missing in the movement of inputs", seen.excitation),
+        ("To decide before a model can be identified", seen.doubts),
+    ):
+        _print_list(console, title, sentences)
+    if missing is not None:
+        _complain(f"note: no figure written; {missing}")
+    elif seen.columns:
+        console.print(f"Wrote {target.with_suffix('.png')} and .svg", soft_wrap=True, markup=False)
+
+
 @app.command()
 def identify(
-    data: Annotated[Path, typer.Argument(help="CSV file with a header row.")],
-    inputs: Annotated[str, typer.Option(help="Input columns, separated by commas.")],
-    outputs: Annotated[str, typer.Option(help="Output columns, separated by commas.")],
-    dt: Annotated[
-        float | None, typer.Option(help="Sample time in seconds; default from a column named time.")
-    ] = None,
-    disturbances: Annotated[
-        str, typer.Option(help="Columns of inputs that are measured and not manipulated.")
-    ] = "",
+    exports: Annotated[list[Path], typer.Argument(help="CSV, Excel or Parquet files of one plant.")],
+    inputs: Inputs,
+    outputs: Outputs,
+    dt: SampleTime = None,
+    disturbances: Disturbances = "",
+    time: TimeColumn = None,
+    time_unit: TimeUnit = None,
+    time_format: TimeFormat = None,
+    time_zone: TimeZone = None,
+    decimal: Decimal = None,
+    bad: Bad = None,
+    good: Good = None,
+    ranges: Ranges = None,
     order: Annotated[int | None, typer.Option(help="Model order; default from the singular values.")] = None,
     weighting: Annotated[str, typer.Option(help="cva, n4sid or moesp.")] = "cva",
     block_rows: Annotated[
@@ -199,99 +297,85 @@ def identify(
     share: Annotated[float, typer.Option(help="Part of the record to estimate on; the rest validates.")] = 2
     / 3,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Model file; default the data file's name with .json.")
+        Path | None, typer.Option("--out", "-o", help="Model file; default the first file's name with .json.")
     ] = None,
 ) -> None:
     """Identify a model from plant data, validate it on the part it has not seen, write it to a file.
 
-    Writes the model file and a validation figure (PNG, SVG) of the same name. Use the file in a study
-    with a table [model] and file = "NAME.json".
+    Reads exports as `mampc inspect` shows them; gaps split them into several records. Writes the model file and a
+    validation figure (PNG, SVG) of the same name. Use the file in a study with a table [model] and
+    file = "NAME.json".
 
-    Example:
+    Examples:
 
-        mampc identify data.csv --inputs u1,u2 --outputs y1,y2 --dt 10
+        mampc identify data.csv --inputs u1,u2 --outputs y1,y2
+
+        mampc identify may.xlsx june.xlsx --inputs FIC-1.OP --outputs TI-3 --bad "Intf Shut" --out column.json
     """
-    from mampc.identification import IOData, n4sid
-    from mampc.report.figures import validation_figure
-    from mampc.report.output import save_figure
+    from mampc.report.identifying import fit_table, identify_and_write
 
-    target = data.with_suffix(".json") if out is None else out
-    if not target.parent.is_dir():
-        raise MampcError(f"--out: expected a file in a folder that exists, received {target}")
-    if target.exists() and not _is_model(target):
-        raise MampcError(
-            f"--out: expected a new file or a model to replace, received {target}, which is neither"
-        )
-    if target.suffix != ".json":
-        raise MampcError(f"--out: expected a name that ends in .json, received {target}")
+    target = exports[0].parent / f"{exports[0].stem}.json" if out is None else out
+    reading = _reading(
+        inputs, outputs, disturbances, ranges, bad, good, dt=dt,
+        time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
+    )  # fmt: skip
+    settings = {
+        "order": order, "weighting": weighting, "block_rows": block_rows, "feedthrough": feedthrough,
+    }  # fmt: skip
     with _progress() as show:
-        show("reading the record")
-        record = IOData.from_csv(
-            data, inputs=_words(inputs), outputs=_words(outputs), disturbances=_words(disturbances), dt=dt
+        outcome = identify_and_write(
+            exports,
+            target,
+            show,
+            reading=reading,
+            settings=settings,
+            share=share,
         )
-        estimation, rest = record.split(share)
-        show("identifying a model")
-        identified = n4sid(
-            estimation, order=order, weighting=weighting, block_rows=block_rows, feedthrough=feedthrough
-        )
-        validation = identified.validate(rest)
-        show("writing the model and its figure")
-        identified.model.save(target)
-        missing = None
-        try:
-            save_figure(validation_figure(rest, validation), target.with_suffix(""))
-        except MampcError as error:
-            missing = str(error)
     console = _console()
-    console.print(_fit_table(record.names.outputs, identified.fit, validation))
+    identified = outcome.identified
+    _print_list(console, "Noticed in the export", outcome.notes)
+    if len(outcome.records) > 1:
+        lengths = ", ".join(map(str, outcome.records[:8])) + (", ..." if len(outcome.records) > 8 else "")
+        console.print(f"Estimated on {len(outcome.records)} pieces of {lengths} samples", soft_wrap=True)
+    console.print(fit_table(outcome))
     values = " ".join(f"{value:.3g}" for value in identified.singular_values[:8])
     console.print(f"Order {identified.order}; first singular values {values}", soft_wrap=True)
     if identified.integrators:
         console.print(
             f"{identified.integrators} of its poles integrate: they are exactly one", soft_wrap=True
         )
-    if identified.stabilised:
-        _complain(
-            "warning: poles outside the unit circle were mirrored to its inside; check the record for drifts"
-        )
-    poor = [
-        name for name, fit in zip(record.names.outputs, validation.fit, strict=True) if not fit > POOR_FIT
-    ]
-    if poor:
-        _complain(
-            f"warning: the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at "
-            "the figure, and try another --order, more --block-rows for long delays, or a richer record"
-        )
-    if missing is not None:
-        _complain(f"note: no figure written; {missing}")
+    for warning in outcome.warnings:
+        _complain(f"warning: {warning}")
     console.print(f"Wrote {target}", soft_wrap=True, markup=False)
 
 
-def _is_model(path: Path) -> bool:
-    from mampc.systems.state_space import StateSpace
+def _reading(
+    inputs: str, outputs: str, disturbances: str, ranges: list[str] | None, bad: list[str] | None,
+    good: list[str] | None, **plain: Any,
+) -> dict[str, Any]:  # fmt: skip
+    """The arguments of `read_export`, out of those of the command line."""
+    words = {"inputs": _words(inputs), "outputs": _words(outputs), "disturbances": _words(disturbances)}
+    limits = {}
+    for text in ranges or ():
+        name, _, values = text.rpartition("=")
+        low, _, high = values.partition(":")
+        try:
+            limits[name.strip()] = (float(low), float(high))
+        except ValueError:
+            raise MampcError(f"--range: expected COLUMN=LOW:HIGH, received {text!r}") from None
+    return words | plain | {"bad": bad or (), "good": good or (), "ranges": limits}
 
-    try:
-        StateSpace.load(path)
-    except MampcError:
-        return False
-    return True
 
-
-def _fit_table(outputs: tuple[str, ...], fit: Any, validation: Any) -> Any:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table()
-    table.add_column("output")
-    for header in ("fit, estimation part (%)", "fit, hold-out part (%)", "whiteness of residuals (p)"):
-        table.add_column(header, justify="right")
-    for name, on_own, on_rest, p in zip(outputs, fit, validation.fit, validation.whiteness, strict=True):
-        table.add_row(escape(name), f"{on_own:.1f}", f"{on_rest:.1f}", f"{p:.3f}")
-    return table
+def _print_list(console: Console, title: str, sentences: Sequence[str]) -> None:
+    if sentences:
+        console.print(f"{title}:", markup=False)
+        for sentence in sentences:
+            console.print(f"  - {sentence}", soft_wrap=True, markup=False)
 
 
 def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
+    """Words between commas; one that holds a comma stands in quotation marks."""
+    return [word.strip() for row in csv.reader([text], skipinitialspace=True) for word in row if word.strip()]
 
 
 def _console() -> Console:

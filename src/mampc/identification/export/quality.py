@@ -26,23 +26,32 @@ def quality_columns(header: Sequence[str], columns: Mapping[str, int]) -> dict[i
     "TI101.Quality" speaks of "TI101", "Quality" of the column on its left, or of all where it stands
     only once.
     """
-    found: dict[int, tuple[str, ...]] = {}
     taken = set(columns.values())
     general = [at for at, word in enumerate(header) if at not in taken and _plain(word) in WORDS]
-    for at, word in enumerate(header):
-        if at in taken or at in general:
-            continue
-        for name, position in columns.items():
-            bare = UNIT.sub("", header[position]).casefold()
-            rest = word.casefold().removeprefix(bare)
-            if rest != word.casefold() and re.match(r"[\W_]", rest) and _plain(rest) in BEHIND_A_NAME:
-                found[at] = (name,)
+    found: dict[int, tuple[str, ...]] = {
+        at: (name,)
+        for at, word in enumerate(header)
+        if at not in taken and at not in general
+        for name, position in columns.items()
+        if _speaks_of(word, header[position])
+    }
     if len(general) == 1:
         found[general[0]] = tuple(columns)
     elif general:
         left = {position: name for name, position in columns.items()}
         found |= {at: (left[at - 1],) for at in general if at - 1 in left}
     return found
+
+
+def is_quality(header: Sequence[str], at: int) -> bool:
+    """Whether a column speaks of others, by its name."""
+    return _plain(header[at]) in WORDS or any(_speaks_of(header[at], name) for name in header)
+
+
+def _speaks_of(word: str, name: str) -> bool:
+    bare = UNIT.sub("", name).casefold()
+    rest = word.casefold().removeprefix(bare)
+    return rest != word.casefold() and re.match(r"[\W_]", rest) is not None and _plain(rest) in BEHIND_A_NAME
 
 
 def drop_bad_quality(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -89,7 +89,7 @@ def read_export(
     """
     origin = str(source) if isinstance(source, (str, Path)) else "DataFrame"
     findings = Findings(origin)
-    names = Names(_listed(inputs), _listed(outputs), disturbances=_listed(disturbances))
+    names = Names(listed(inputs), listed(outputs), disturbances=listed(disturbances))
     wanted = (*names.inputs, *names.disturbances, *names.outputs)
     if not names.inputs + names.disturbances or not names.outputs:
         raise MampcError(
@@ -98,20 +98,16 @@ def read_export(
         )
     if dt is not None:
         dt = as_number("dt", dt, 0.0, exclusive=True)
-    how = TimeReading(*(options.get(key) for key in ("time", "time_unit", "time_format", "time_zone")))  # type: ignore[arg-type]
-    reading = Reading(
-        options.get("decimal"), tuple(_listed(options.get("bad", ()))), options.get("ranges", {})
-    )
-    unknown = [name for name in reading.ranges if name not in wanted]
-    if unknown:
-        raise MampcError(f"ranges: expected names among {wanted}, received {shown(unknown[0])}")
+    how, reading = readings(options, wanted)
 
     sheet = open_sheet(source, wanted, findings)
     positions = {name: _position(sheet.header, name) for name in wanted}
+    units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
+    names = replace(names, units=units)
     quality = tuple(quality_columns(sheet.header, positions))
     clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
     columns = read_numbers(sheet, positions, reading, findings)
-    drop_bad_quality(sheet, columns, positions, _listed(options.get("good", ())), findings)
+    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
     for column in columns:
         if column.marks:
             findings.change(str(column))
@@ -171,11 +167,24 @@ def read_one(source: Any, **options: Any) -> IOData:
     return export.records[0]
 
 
+def readings(options: ReadingOptions, names: Sequence[str] | None) -> tuple[TimeReading, Reading]:
+    """The options, checked; `names` are the columns that may have a range, None for any."""
+    how = TimeReading(
+        options.get("time"), options.get("time_unit"), options.get("time_format"), options.get("time_zone")
+    )
+    reading = Reading(options.get("decimal"), listed(options.get("bad", ())), options.get("ranges", {}))
+    unknown = [name for name in reading.ranges if names is not None and name not in names]
+    if unknown:
+        raise MampcError(f"ranges: expected names among {tuple(names or ())}, received {shown(unknown[0])}")
+    return how, reading
+
+
 def _position(header: Sequence[str], name: str) -> int:
     at = find_column(header, name)
     assert at is not None  # the sheet was opened with this name
     return at
 
 
-def _listed(names: Any) -> tuple[Any, ...]:
+def listed(names: Any) -> tuple[Any, ...]:
+    """One word or several, as a tuple."""
     return (names,) if isinstance(names, (str, int, float)) else tuple(names)

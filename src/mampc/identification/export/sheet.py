@@ -304,8 +304,11 @@ def _measured(
             f"{rows_text([number for number, _ in descriptions])} under the header hold no numbers: "
             f"{shown(' | '.join(descriptions[-1][1]), 100)}"
         )
-        shortest = min(descriptions, key=lambda line: sum(map(len, line[1])))[1]
-        units = {at: unit for at, unit in enumerate(shortest[:width]) if unit and not units.get(at)} | units
+        rows_of_units = [
+            cells for _, cells in descriptions if all(re.fullmatch(r"\S{0,12}", cell) for cell in cells)
+        ]
+        if rows_of_units:
+            units = {at: unit for at, unit in enumerate(rows_of_units[-1][:width]) if unit} | units
 
     def chunks(columns: Sequence[int]) -> Iterator[list[Cells]]:
         data = (

@@ -1,0 +1,206 @@
+"""What an export holds, before anybody decides what to identify from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+
+from mampc.base.checks import Array, as_number
+from mampc.identification.export.clock import Clock, read_clock
+from mampc.identification.export.findings import Findings, counted
+from mampc.identification.export.grid import make_grid, pieces
+from mampc.identification.export.numbers import Column, numeric_share, read_numbers
+from mampc.identification.export.quality import drop_bad_quality, is_quality
+from mampc.identification.export.reading import ReadingOptions, listed, readings
+from mampc.identification.export.sheet import Sheet, find_column, open_sheet
+
+HELD = 0.5  # share of samples: what keeps its value more often moves in steps
+FEW_MOVES = 10  # of an input; fewer say little about anything but the largest of them
+TOGETHER = 0.9  # correlation of moves from which two inputs cannot be told apart
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnSummary:
+    """One column of numbers.
+
+    Attributes:
+        name, unit: as they stand in the file; an empty unit where there is none.
+        values: in the order of time, not-a-number where there is none; shape (n,).
+        marks: what stands in the place of numbers, as a sentence; empty where nothing does.
+        missing: how many rows have no number.
+        moves: how often the value changes from one sample to the next.
+        held: the median of how many samples it keeps a value.
+        verdict: what its movement makes of it.
+    """
+
+    name: str
+    unit: str
+    values: Array
+    marks: str
+    missing: int
+    moves: int
+    held: float
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """An export, looked at.
+
+    Attributes:
+        origin: the file.
+        columns: those with numbers, the column of times left out.
+        others: names of columns without numbers.
+        time: the column of times, or empty.
+        seconds: of the rows in order, shape (n,).
+        dt: seconds between samples, or None where they are not even.
+        start, end: the first and last moment, as text.
+        pieces: numbers of rows between gaps.
+        excitation: what is missing in the movement of the inputs, a sentence each.
+        notes: all that was noticed.
+        doubts: what has to be decided before a record can be read.
+    """
+
+    origin: str
+    columns: tuple[ColumnSummary, ...]
+    others: tuple[str, ...]
+    time: str
+    seconds: Array
+    dt: float | None
+    start: str
+    end: str
+    pieces: tuple[int, ...]
+    excitation: tuple[str, ...]
+    notes: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+
+def inspect_export(
+    source: Any,
+    *,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    disturbances: Sequence[str] = (),
+    dt: float | None = None,
+    **options: Unpack[ReadingOptions],
+) -> Inspection:
+    """Look at an export as `read_export` would read it, without refusing what it cannot decide.
+
+    Args:
+        source: path of a file, or a pandas DataFrame.
+        inputs, outputs, disturbances: columns to look at; default all that hold numbers.
+        dt: sample time in seconds, where there is no column of times.
+        options: see `ReadingOptions`.
+
+    Raises:
+        MampcError: a file that cannot be read at all.
+    """
+    findings = Findings(str(source) if isinstance(source, (str, Path)) else "DataFrame")
+    wanted = (*listed(inputs), *listed(disturbances), *listed(outputs))
+    how, reading = readings(options, wanted or None)
+    if dt is not None:
+        dt = as_number("dt", dt, 0.0, exclusive=True)
+    sheet = open_sheet(source, wanted, findings)
+    taken = [at for name in wanted if (at := find_column(sheet.header, name)) is not None]
+    qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet.header, at)]
+    clock = read_clock(sheet, [*taken, *qualities], how, findings)
+    free = [
+        at
+        for at in range(len(sheet.header))
+        if at not in (*qualities, *(clock.columns if clock else ())) and sheet.header[at]
+    ]
+    positions = dict(zip(wanted, taken, strict=True)) or _numeric(sheet, free)
+    others = tuple(sheet.header[at] for at in free if at not in positions.values()) if not wanted else ()
+    columns = read_numbers(sheet, positions, reading, findings)
+    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
+    for column in columns:
+        if column.marks:
+            findings.note(str(column))
+    values = np.column_stack([column.values for column in columns]) if columns else np.empty((len(sheet), 0))
+    grid = make_grid(clock, values, sheet.numbers, dt, findings)
+    order, seconds = (np.arange(len(values)), np.arange(len(values)) * 1.0)
+    lengths: tuple[int, ...] = (len(values),)
+    if grid is not None:
+        order, seconds = grid.order, grid.seconds
+        usable = (
+            np.asarray(~np.isnan(values[order]).any(axis=1)) if wanted else np.ones(len(order), dtype=bool)
+        )
+        lengths = tuple(len(piece) for piece in pieces(grid, clock, usable, sheet.numbers, findings))
+    elif clock is not None:
+        order = np.argsort(clock.seconds, kind="stable")[: np.count_nonzero(~np.isnan(clock.seconds))]
+        seconds = clock.seconds[order]
+    summaries = tuple(
+        _summary(column, sheet.units.get(positions[column.name], ""), order) for column in columns
+    )
+    return Inspection(
+        findings.origin, summaries, others, clock.name if clock else "", seconds, grid.dt if grid else None,
+        *_ends(clock, seconds), lengths, tuple(_missing_excitation(summaries, listed(inputs))),
+        tuple(findings.notes), tuple(findings.doubts),
+    )  # fmt: skip
+
+
+def _numeric(sheet: Sheet, free: Sequence[int]) -> dict[str, int]:
+    """Columns with numbers in more than half of the first rows' filled cells; of two with one name, the first."""
+    found: dict[str, int] = {}
+    for at in free:
+        if numeric_share(row[at] for row in sheet.sample) > 0.5:
+            found.setdefault(sheet.header[at], at)
+    return found
+
+
+def _ends(clock: Clock | None, seconds: Array) -> tuple[str, str]:
+    if clock is None or not len(seconds):
+        return "", ""
+    return clock(float(seconds[0])), clock(float(seconds[-1]))
+
+
+def _summary(column: Column, unit: str, order: Any) -> ColumnSummary:
+    values = column.values[order]
+    known = values[~np.isnan(values)]
+    changes = np.flatnonzero(np.diff(known))
+    moves = len(changes)
+    held = float(np.median(np.diff(changes))) if moves > 1 else float(len(known))
+    if not moves:
+        verdict = "never moves"
+    elif moves > HELD * (len(known) - 1):
+        verdict = "moves at nearly every sample: measured, or under control"
+    elif moves < FEW_MOVES:
+        verdict = "moves in steps: too few for an input"
+    else:
+        verdict = "moves in steps: could be an input"
+    missing = len(values) - len(known)
+    return ColumnSummary(
+        column.name, unit, values, str(column) if column.marks else "", missing, moves, held, verdict
+    )
+
+
+def _missing_excitation(columns: Sequence[ColumnSummary], inputs: Sequence[str]) -> list[str]:
+    """What the inputs' movement leaves open, of the columns named, else of those that could be inputs."""
+    chosen = [
+        column
+        for column in columns
+        if column.name in inputs or (not inputs and column.verdict.endswith("could be an input"))
+    ]
+    said = [
+        f"{column.name} moves {counted(column.moves, 'time')} in {counted(len(column.values), 'sample')}: move it up "
+        f"and down at least {FEW_MOVES} times"
+        for column in chosen
+        if column.moves < FEW_MOVES
+    ]
+    moves: Mapping[str, Array] = {column.name: np.nan_to_num(np.diff(column.values)) for column in chosen}
+    for (one, a), (other, b) in combinations(moves.items(), 2):
+        size = float(np.linalg.norm(a) * np.linalg.norm(b))
+        together = float(a @ b) / size if size else 0.0
+        if abs(together) > TOGETHER:
+            said.append(
+                f"{one} and {other} move together (correlation of moves {together:.2f}): their effects cannot be told "
+                "apart; move them at different times"
+            )
+    if not chosen:
+        said.append("no column moves in steps, up and down, as an input under test does")
+    return said

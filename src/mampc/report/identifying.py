@@ -1,0 +1,146 @@
+"""From exports to a model file: which part estimates, which validates, and what to say of the result."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mampc.base.checks import as_number
+from mampc.base.errors import MampcError
+from mampc.identification import Identified, IOData, Validation, n4sid, read_export
+from mampc.report.figures import validation_figure
+from mampc.report.output import save_figure
+
+POOR_FIT = 40.0  # percent; a model below it is hardly one to control with
+SHORTEST = 10  # samples on either side of a cut
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of exports.
+
+    Attributes:
+        identified: the model, and its fit to the part that it was estimated on.
+        validation: on a part that it has not seen.
+        notes: what reading the exports noticed and did.
+        warnings: what to look at before the model is used.
+        records: numbers of samples to estimate on, one each.
+    """
+
+    identified: Identified
+    validation: Validation
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    records: tuple[int, ...]
+
+
+def identify_and_write(
+    exports: Sequence[Path],
+    target: Path,
+    show: Callable[[str], None],
+    *,
+    reading: dict[str, Any],
+    settings: dict[str, Any],
+    share: float,
+) -> Outcome:
+    """Read exports, identify a model, validate it and write it beside its validation figure.
+
+    Args:
+        exports: files of one plant.
+        target: model file, whose name ends in .json.
+        show: is told each stage.
+        reading: arguments of `read_export`.
+        settings: arguments of `n4sid`.
+        share: part of the samples to estimate on.
+    """
+    show("reading the record")
+    records: list[IOData] = []
+    notes: list[str] = []
+    for path in exports:
+        export = read_export(path, **reading)
+        records += export.records
+        notes += [f"{path}: {note}" if len(exports) > 1 else note for note in export.notes]
+    require_writable(target)
+    estimation, rest = hold_out(records, share)
+    show("identifying a model")
+    identified = n4sid(estimation if len(estimation) > 1 else estimation[0], **settings)
+    validation = identified.validate(rest)
+    show("writing the model and its figure")
+    identified.model.save(target)
+    warnings = []
+    if identified.stabilised:
+        warnings.append(
+            "poles outside the unit circle were mirrored to its inside; check the record for drifts"
+        )
+    poor = [name for name, fit in zip(rest.names.outputs, validation.fit, strict=True) if not fit > POOR_FIT]
+    if poor:
+        warnings.append(
+            f"the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at the "
+            "figure, and try another --order, more --block-rows for long delays, or a richer record"
+        )
+    try:
+        save_figure(validation_figure(rest, validation), target.with_suffix(""))
+    except MampcError as error:
+        warnings.append(f"no figure written; {error}")
+    return Outcome(identified, validation, tuple(notes), tuple(warnings), tuple(map(len, estimation)))
+
+
+def hold_out(records: Sequence[IOData], share: float) -> tuple[list[IOData], IOData]:
+    """Records to estimate on, about `share` of all samples from the first on, and the longest of the rest.
+
+    Raises:
+        MampcError: a share that leaves no samples on one side.
+    """
+    if len(records) == 1:
+        before, after = records[0].split(share)
+        return [before], after
+    left = round(as_number("share", share, 0.0) * sum(map(len, records)))
+    estimation, rest = [], []
+    for record in records:
+        if left >= len(record) - SHORTEST:
+            estimation.append(record)
+        elif left < SHORTEST:
+            rest.append(record)
+        else:
+            estimation.append(record[:left])
+            rest.append(record[left:])
+        left -= min(left, len(record))
+    if not estimation or not rest:
+        raise MampcError(f"share: expected one that leaves samples on both sides, received {share}")
+    return estimation, max(rest, key=len)
+
+
+def fit_table(outcome: Outcome) -> Any:
+    """One row an output."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table()
+    table.add_column("output")
+    for header in ("fit, estimation part (%)", "fit, hold-out part (%)", "whiteness of residuals (p)"):
+        table.add_column(header, justify="right")
+    outputs, validation = outcome.identified.model.names.outputs, outcome.validation
+    rows = zip(outputs, outcome.identified.fit, validation.fit, validation.whiteness, strict=True)
+    for name, on_own, on_rest, p in rows:
+        table.add_row(escape(name), f"{on_own:.1f}", f"{on_rest:.1f}", f"{p:.3f}")
+    return table
+
+
+def require_writable(target: Path) -> None:
+    """Raise `MampcError` unless the target is a new file or a model, in a folder that is there."""
+    from mampc.systems.state_space import StateSpace
+
+    if target.suffix != ".json":
+        raise MampcError(f"--out: expected a name that ends in .json, received {target}")
+    if not os.path.isdir(target.parent):
+        raise MampcError(f"--out: expected a file in a folder that exists, received {target}")
+    if os.path.exists(target):
+        try:
+            StateSpace.load(target)
+        except MampcError:
+            raise MampcError(
+                f"--out: expected a new file or a model to replace, received {target}, which is neither"
+            ) from None
