@@ -18,12 +18,14 @@ interactive = pytest.importorskip("mampc.report.interactive")
 pytest.importorskip("plotly", reason="needs plotly, which mampc[report] brings")
 
 NASTY = '</script><img src=x onerror=alert(1)> $1 & "2" {3}'
+LONG = "without noise and with a name as long as a window on a telephone is never wide"
 SHORT = template().replace("steps = 145", "steps = 40").replace("at = 100", "at = 30")
 
 
 @pytest.fixture(scope="module")
 def result():
-    return run_study(parse_study(SHORT.replace('name = "exact budget"', f"name = '{NASTY}'")))
+    named = SHORT.replace('name = "noise-free"', f'name = "{LONG}"')
+    return run_study(parse_study(named.replace('name = "exact budget"', f"name = '{NASTY}'")))
 
 
 @pytest.fixture(scope="module")

@@ -319,8 +319,8 @@ def _number(value: float, digits: int = 2) -> str:
 def _duration(seconds: float) -> str:
     for unit, size in (("days", DAY), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * size:
-            return f"{_number(seconds / size)} {unit}"
-    return f"{_number(seconds)} s"
+            return f"{_number(seconds / size)}\u00a0{unit}"
+    return f"{_number(seconds)}\u00a0s"
 
 
 def _words(names: tuple[str, ...]) -> str:

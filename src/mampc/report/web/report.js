@@ -22,6 +22,10 @@ function plain(text, width) {
   return lines.map(safe).join("<br>");
 }
 
+function short(text) { // of a point; the sentence above says the whole name
+  return plain(text.length > 26 ? text.slice(0, 25).trim() + "…" : text, 26).replace(/<br>/g, " ");
+}
+
 function element(name, text, parent) {
   const made = document.createElement(name);
   made.textContent = text;
@@ -36,8 +40,11 @@ function drawTradeoff() {
   const colour = (i) => (i === choice ? BLUE : i === base ? GREY : PALE);
   const points = {
     x: choices.map((one) => one.x), y: choices.map((one) => one.y), mode: "markers+text", cliponaxis: false,
-    text: choices.map((one, i) => (i === choice || i === base ? plain(one.name, 22) : "")),
-    textposition: choices.map((one) => (one.x < 0.2 * top ? "top right" : one.x > 0.8 * top ? "top left" : "top center")),
+    text: choices.map((one, i) => (i === choice || i === base ? short(one.name) : "")),
+    textposition: choices.map((one, i) => {
+      const side = one.x < 0.2 * top ? "right" : one.x > 0.8 * top ? "left" : "center";
+      return (i === choice ? "top " : "bottom ") + side;
+    }),
     marker: { size: choices.map((_, i) => (i === choice ? 15 : 11)), color: choices.map((_, i) => colour(i)), opacity: 1 },
     hovertext: choices.map((one) => plain(one.name, 40) + "<br>" + plain(one.short, 40)), hoverinfo: "text",
   };
