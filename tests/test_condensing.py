@@ -7,6 +7,7 @@ import mampc
 from builders import cost_of, predicted, random_model, random_weight, sample_data, tank_model, tank_problem
 from mampc.program.condensing import CondensedQP
 from mampc.program.daqp import DaqpSolver
+from mampc.program.prediction import Prediction
 from mampc.program.qp import QPStatus, QuadraticProgram
 
 SEEDS = range(12)
@@ -49,8 +50,13 @@ def test_predictions_equal_a_simulation_of_the_model(seed):
         given["input_disturbance"], given["output_disturbance"],
     )  # fmt: skip
     reference = np.broadcast_to(given["reference"], y.shape)
-    error = sample_data(condensed, **given).error - condensed.theta @ d
-    np.testing.assert_allclose(error, (reference - y).ravel(), atol=1e-12)
+    free = Prediction(problem, condensed.parameter).free
+    p = condensed.parameter.vector(**given | {"reference": reference})
+    assert condensed.cost(sample_data(condensed, **given), d) == pytest.approx(
+        np.square(reference - y).sum() + d @ condensed.R @ d, rel=1e-12
+    )
+    predicted_y = problem.model.y_op + (free @ p + condensed.theta @ d).reshape(y.shape)
+    np.testing.assert_allclose(predicted_y, y, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -131,11 +137,8 @@ def test_a_restricted_program_equals_the_full_one_with_zeros_forced(seed, limits
     pattern = np.random.default_rng(seed).random(condensed.n_moves) < 0.5
     pattern[0] = True
     restriction = condensed.restricted(pattern)
-    part = DaqpSolver(restriction.program).solve(
-        sample.f[restriction.columns],
-        sample.lower[restriction.bounds],
-        sample.upper[restriction.bounds],
-    )
+    optimum = restriction.optimum(sample.target)
+    part = restriction.solve(optimum, sample.lower[restriction.bounds], sample.upper[restriction.bounds])
     forced = QuadraticProgram(  # the full program, each idle move fixed by a row of its own
         condensed.program.H,
         np.vstack([condensed.program.A, np.eye(v + condensed.n_moves)[v:][~pattern]]),
@@ -144,7 +147,11 @@ def test_a_restricted_program_equals_the_full_one_with_zeros_forced(seed, limits
     idle = np.zeros((~pattern).sum())
     full = DaqpSolver(forced).solve(sample.f, np.append(sample.lower, idle), np.append(sample.upper, idle))
     assert part.status is full.status is QPStatus.OPTIMAL
-    np.testing.assert_allclose(part.z, full.z[restriction.columns], atol=1e-8)
+    np.testing.assert_allclose(part.moves, full.z[v:][pattern], atol=1e-8)
+    moves = np.zeros(condensed.n_moves)
+    moves[pattern] = part.moves
+    objective = sample.cost + restriction.excess(sample.target) + part.excess
+    assert objective == pytest.approx(condensed.cost(sample, moves), rel=1e-9)
 
 
 def test_a_restricted_program_leaves_out_the_rows_of_inputs_at_rest():
@@ -152,7 +159,7 @@ def test_a_restricted_program_leaves_out_the_rows_of_inputs_at_rest():
     pattern = np.zeros(10, dtype=bool)
     pattern[[0, 4, 5]] = True  # u1 at samples 0 and 2, u2 at sample 2
     restriction = condensed.restricted(pattern)
-    assert (restriction.program.n_simple, len(restriction.program.A)) == (1, 2)
+    assert restriction.rows.shape == (3, 3)  # u1 now, and each input where it moves
 
 
 def test_weights_that_leave_moves_undetermined_are_refused():

@@ -19,7 +19,7 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
-from mampc.program.daqp import DaqpSolver, active_bounds
+from mampc.program.daqp import active_bounds
 from mampc.program.limits_now import InputRange, LimitsNow, UsualLimits
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.sample import Indices, Sample
@@ -51,13 +51,11 @@ class Controller(ABC):
         if not isinstance(problem, TrackingProblem):
             raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
         self.problem = problem
-        if condensed is None:
-            condensed = CondensedQP(problem, bound_every_move=bound_every_move)
-        self.condensed = condensed
         if time_limit is not None:
             time_limit = as_number("time_limit", time_limit, 0.0, exclusive=True)
-        self._time_limit = time_limit
-        self._solver = DaqpSolver(self.condensed.program, time_limit=time_limit)
+        if condensed is None:
+            condensed = CondensedQP(problem, bound_every_move=bound_every_move, time_limit=time_limit)
+        self.condensed = condensed
         self._while_frozen: PatternSolver | None = None  # plain MPC while some inputs may not move
         limits, model = problem.limits, problem.model
         self._usual_limits = UsualLimits(self.condensed)
@@ -197,7 +195,7 @@ class Controller(ABC):
     def _may_hold(self, sample: Sample) -> bool:
         """Whether no move at all keeps the limits of inputs and moves."""
         condensed = self.condensed
-        moves, inputs = slice(condensed.n_violations, condensed.program.n_simple), condensed.bounds.input_rows
+        moves, inputs = slice(condensed.n_violations, condensed.bounds.n_simple), condensed.bounds.input_rows
         return all(
             bool((sample.lower[rows] <= 0).all() and (sample.upper[rows] >= 0).all())
             for rows in (moves, inputs)
@@ -277,22 +275,18 @@ class Controller(ABC):
         margins = sample.margins
         if margins[margins.argmin()] > INSIDE:
             return Plan(sample.moves, Status.OPTIMAL, 0, None, None, sample.inputs, sample.cost)
-        self._solver.start(state.active)
-        solution = self._solver.solve(sample.f, sample.lower, sample.upper)
-        if solution.z is None or solution.multipliers is None:
-            return Plan(None, HELD_BY[solution.status], solution.iterations)
+        nearest = self.condensed.plain.solve(sample.moves, sample.lower, sample.upper, state.active)
+        if nearest.moves is None or nearest.multipliers is None:
+            return Plan(None, HELD_BY[nearest.status], nearest.iterations)
         return Plan(
-            solution.z[self.condensed.n_violations :], Status.OPTIMAL, solution.iterations, None,
-            active=active_bounds(solution.multipliers),
-        )  # fmt: skip
+            nearest.moves, Status.OPTIMAL, nearest.iterations, None, active=active_bounds(nearest.multipliers)
+        )
 
     def _unrestricted_but_frozen(self, sample: Sample, frozen: Indices) -> Plan:
         """Plain MPC where some inputs may not move for some samples."""
         m, n_c = len(frozen), self.problem.control_horizon
         if self._while_frozen is None:
-            self._while_frozen = PatternSolver(
-                self.condensed, AdmissiblePatterns(MoveRules(), m, n_c), time_limit=self._time_limit
-            )
+            self._while_frozen = PatternSolver(self.condensed, AdmissiblePatterns(MoveRules(), m, n_c))
         solved = self._while_frozen.solve(sample, (np.arange(n_c)[:, None] >= frozen).ravel())
         if solved.moves is None:
             return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.iterations)

@@ -60,6 +60,7 @@ def way_back(
     change = inside - applied
     parameter = sample.parameter.copy()
     parameter[condensed.parameter.u_previous] = inside
+    parameter[condensed.parameter.u_deviation] = inside - problem.model.u_op
     frozen = sample.frozen
     # Where moves are limited the way back is all that an input moves by at once.
     spent = (change != 0) & np.isfinite(problem.limits.du_max)

@@ -282,10 +282,12 @@ class _Loops:
         place = self._regulator.controller.condensed.parameter
         parameters = np.ones((len(y), place.one.stop + ahead.shape[1]))
         parameters[:, place.x], parameters[:, place.u_previous] = estimate.x, u
+        parameters[:, place.u_deviation] = u
         parameters[:, place.input_disturbance] = estimate.input_disturbance
         parameters[:, place.output_disturbance] = estimate.output_disturbance
         parameters[:, place.measured_disturbance] = told
         parameters[:, place.one.stop :] = ahead
+        parameters -= place.origin[parameters.shape[1]]
         usable: BoolArray = np.asarray((np.abs(parameters) < LARGEST).all(axis=1))
         decided, first = self._plans.decide(np.where(usable[:, None], parameters, 0.0), self._inputs)
         decided &= fine & usable

@@ -100,7 +100,7 @@ class Regulator:
         state, problem = RegulatorState.from_json(text), self.controller.problem
         expected = self.initial_state().shapes() | {
             "controller.guess": (problem.control_horizon, problem.model.n_inputs),
-            "controller.active": (self.controller.condensed.program.n_bounds,),
+            "controller.active": (self.controller.condensed.bounds.size,),
         }
         for place, shape in state.shapes().items():
             if place == "controller.memory":  # what a rule around a controller keeps; it knows what fits

@@ -15,9 +15,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_flag
-from mampc.base.tolerances import INSIDE, TIE
+from mampc.base.tolerances import INSIDE, tie
 from mampc.base.words import Remark, Status
-from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.search import Exact, ExactSearch
 from mampc.methods.method import HELD_BY, Plan
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
@@ -83,10 +82,6 @@ class HeuristicSearch:
     def _referee(self) -> ExactSearch:
         return Exact(time_limit=REFEREE_SECONDS).prepare(self.condensed, self.rules)
 
-    @cached_property
-    def _relaxation(self) -> Relaxation:
-        return Relaxation(self.condensed)
-
     def plan(self, sample: Sample, inputs: Array, guess: Array | None) -> Plan:
         """The best plan on any proposed pattern."""
         allowance = self.admissible.allowance(inputs, sample.frozen)
@@ -132,8 +127,7 @@ class HeuristicSearch:
 
     def _multipliers_of_plain(self, sample: Sample) -> Array | None:
         """The multipliers of the limits, shape (n_bounds,), with every move free; None where nothing keeps these."""
-        self._relaxation.begin()
-        return self._relaxation.of_plain(sample)
+        return self.condensed.plain.solve(sample.moves, sample.lower, sample.upper).multipliers
 
     def _priced_limits(self, sample: Sample) -> Array:
         """The linear term of the moves, with the limits priced by the multipliers of plain MPC."""
@@ -158,6 +152,6 @@ class HeuristicSearch:
         bound = proof.objective if proof.lower_bound is None else proof.lower_bound
         if bound is None or plan.objective is None:
             return plan
-        if plan.objective - bound <= 10 * TIE * max(1e-6, sample.constant):
+        if plan.objective - bound <= 10 * tie(plan.objective, self.condensed.rounding(sample)):
             return plan._replace(status=Status.OPTIMAL, lower_bound=None)
         return plan._replace(lower_bound=min(bound, plan.objective))

@@ -5,7 +5,7 @@ The bounded quantities, in this order:
     violations e      one per limited output, at least zero                                          (simple)
     moves             du_j within du_max, or without move limits du_0 within u_min - u_prev ..       (simple)
     inputs            u_j - u_prev within u_min - u_prev .. u_max - u_prev, those not said above
-    outputs           theta d - rho_i e <= y_max - free, then theta d + rho_i e >= y_min - free
+    outputs           theta d - rho_i e <= y_max - y_op - free, then theta d + rho_i e >= y_min - y_op - free
 
 rho falls evenly along the horizon, see `TrackingProblem`; e is scaled as stated there.
 """
@@ -31,6 +31,7 @@ class Bounds:
         every_move: whether every move has a simple bound; if not, the first inputs have.
         n_violations: how many outputs are limited.
         n_simple: violations and moves with simple bounds.
+        size: how many there are.
         rows: the other bounded quantities per (violations, moves), shape (rows, n_violations + n_moves).
         of_moves: all bounded quantities but the violations, per move, shape (n_bounds - n_violations, n_moves).
         lower, upper: maps of the parameter, shape (n_bounds, its size).
@@ -74,13 +75,14 @@ class Bounds:
         )
         self.of_moves = np.vstack([np.eye(n_simple - v, n), self.rows[:, v:]])
         self.input_rows = slice(n_simple, n_simple + len(inputs))
-        self.move_of_bound = np.full(n_simple + len(self.rows), -1)
+        self.size = n_simple + len(self.rows)
+        self.move_of_bound = np.full(self.size, -1)
         self.move_of_bound[self.input_rows] = inputs
         self.above_rows = self.input_rows.stop + np.arange(len(self.above))
         self.below_rows = self.input_rows.stop + len(self.above) + np.arange(len(self.below))
 
         self._theta_above, self._theta_below = theta[self.above], theta[self.below]
-        self.lower, self.upper = (parameter.no_map(len(self.move_of_bound)) for _ in range(2))
+        self.lower, self.upper = (parameter.no_map(self.size) for _ in range(2))
         self._bound_inputs(problem, parameter, inputs)
         self._bound_outputs(problem, parameter, prediction.free)
 
@@ -105,12 +107,12 @@ class Bounds:
 
     def _bound_outputs(self, problem: TrackingProblem, parameter: Parameter, free: Array) -> None:
         """Fill in the bounds of the outputs; each row has one, above or below."""
-        limits, l, one = problem.limits, problem.model.n_outputs, parameter.one
+        limits, l, one, y_op = problem.limits, problem.model.n_outputs, parameter.one, problem.model.y_op
         self.upper[self.above_rows] = -free[self.above]
-        self.upper[self.above_rows, one] += limits.y_max[self.above % l, None]
+        self.upper[self.above_rows, one] += (limits.y_max - y_op)[self.above % l, None]
         self.lower[self.above_rows, one] = -UNBOUNDED
         self.lower[self.below_rows] = -free[self.below]
-        self.lower[self.below_rows, one] += limits.y_min[self.below % l, None]
+        self.lower[self.below_rows, one] += (limits.y_min - y_op)[self.below % l, None]
         self.upper[self.below_rows, one] = UNBOUNDED
 
     def excess(self, moves: Array, lower: Array, upper: Array, *, faded: bool = False) -> Array:

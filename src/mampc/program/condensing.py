@@ -1,6 +1,6 @@
 """Condensing: the tracking problem as a dense quadratic program in the moves d = (du_0, ..., du_{nc-1}).
 
-With the predicted outputs free + theta d (see `prediction`) and error = Q^(1/2) (r - free)
+With the predicted outputs free + theta d (see `prediction`) and error = Q^(1/2) (r - y_op - free)
 
     cost = |error - Q^(1/2) theta d|^2 + |R^(1/2) d|^2 = |W d - (error, 0)|^2,    W = [Q^(1/2) theta; R^(1/2)]
 
@@ -20,26 +20,23 @@ On a move pattern S (all other moves zero) the optimum without limits is affine 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, ComplexArray
+from mampc.base.errors import MampcError
 from mampc.program.bounds import Bounds
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
 from mampc.program.qp import QuadraticProgram
+from mampc.program.restriction import Restriction
 from mampc.program.sample import Indices, LeastSquares, Parts, PatternOptimum, Sample
 from mampc.program.tail import square_root, tail
 
-
-class Restriction(NamedTuple):
-    """A program on some of the moves (the others are zero), and where its data stand in the full one."""
-
-    program: QuadraticProgram
-    columns: Indices
-    bounds: Indices
+ROUNDING = 1e-15  # of what a sum adds up: how far it may be from the truth
+SINGULAR = 1e13  # condition of U, of unit columns, from which on rounding determines some move
 
 
 class CondensedQP:
@@ -50,7 +47,9 @@ class CondensedQP:
         U: upper triangular, shape (n_moves, n_moves).
         H: 2 U' U, the Hessian in the moves.
         R: weights of the moves, shape (n_moves, n_moves).
-        program: the `QuadraticProgram` in z = (violations, d).
+        plain: the problem with every move free, which is plain MPC; whoever solves it shares its solver.
+        lengths: of U's columns, shape (n_moves,).
+        condition: of U with columns of length 1, so that units do not count.
         parameter: where each quantity stands in p.
         bounds: which quantities are bounded, and between what.
         theta: predicted outputs per move, shape ((np + 1) l, n_moves).
@@ -62,14 +61,18 @@ class CondensedQP:
     Args:
         problem: what to condense.
         bound_every_move: give every move a simple bound, though du_max may be infinite.
+        time_limit: seconds that one program may take; None for no limit.
 
     Raises:
         MampcError: the moves are not all determined by the weights (H is singular), or an unstable
             model's predictions overflow.
     """
 
-    def __init__(self, problem: TrackingProblem, *, bound_every_move: bool = False) -> None:
-        self.problem, n_c, m = problem, problem.control_horizon, problem.model.n_inputs
+    def __init__(
+        self, problem: TrackingProblem, *, bound_every_move: bool = False, time_limit: float | None = None
+    ) -> None:
+        self.problem, self._time_limit = problem, time_limit
+        n_c, m = problem.control_horizon, problem.model.n_inputs
         n = self.n_moves = n_c * m
         self.cumulate = np.kron(np.tri(n_c), np.eye(m))
         self.parameter = parameter = Parameter(problem)
@@ -91,20 +94,22 @@ class CondensedQP:
             self.R[:m, :m] = 0.0
         self._triangularise()
 
-        full = np.zeros((v + n, v + n))
-        full[:v, :v], full[v:, v:] = problem.output_limit_weight * np.eye(v), self.H
-        self.program = QuadraticProgram(full, self.bounds.rows, self.bounds.n_simple)
         f = parameter.no_map(v + n)
         f[:v, parameter.one] = problem.output_limit_weight
         f[v:] = -2 * self.U.T @ self._target
         self._u_previous = parameter.no_map(n)
         self._u_previous[:, parameter.u_previous] = np.tile(np.eye(m), (n_c, 1))
+        self.plain = self.restricted(np.ones(n, dtype=bool))
         self._preview_map, self.parts = _stacked(
-            **self._optimum_maps(np.ones(n, dtype=bool)), target=self._target, f=f, f_moves=f[v:],
-            error=self._error, lower=self.bounds.lower, upper=self.bounds.upper,
+            **self._optimum_maps(self.plain), target=self._target, f=f, f_moves=f[v:],
+            lower=self.bounds.lower, upper=self.bounds.upper,
         )  # fmt: skip
         self._constant_map = parameter.with_constant_reference(self._preview_map)
         self.map_bytes = self._preview_map.nbytes
+        self._error_lengths = {
+            of_error.shape[1]: np.linalg.norm(of_error, axis=0)
+            for of_error in (self._error, parameter.with_constant_reference(self._error))
+        }
         self.error_of_reference = parameter.with_constant_reference(self._error)[:, parameter.one.stop :]
 
     def _triangularise(self) -> None:
@@ -112,6 +117,13 @@ class CondensedQP:
         W = np.vstack([self.weighted_theta, square_root(self.R)])
         error = np.vstack([self._error, self.parameter.no_map(self.n_moves)])
         Q, self.U = np.linalg.qr(W)
+        self.lengths = np.linalg.norm(self.U, axis=0)
+        self.condition = float(np.linalg.cond(self.U / np.where(self.lengths > 0, self.lengths, 1.0)))
+        if not self.condition < SINGULAR:
+            raise MampcError(
+                "CondensedQP: expected a positive definite Hessian, so that weights and outputs determine every move, "
+                f"received a condition of {self.condition:.1e} squared; give every move a weight"
+            )
         self.H = 2 * (self.U.T @ self.U)
         self._target = Q.T @ error
         rest = error - Q @ self._target
@@ -119,30 +131,21 @@ class CondensedQP:
         self._target += lost
         self._free_residual: Array = np.asarray(np.linalg.qr(rest - Q @ lost, mode="r"))
 
-    def _optimum_maps(self, pattern: BoolArray) -> dict[str, Array]:
+    def _optimum_maps(self, restriction: Restriction) -> dict[str, Array]:
         """The optimum without limits on a pattern: its margins, moves, inputs and residual as maps of p."""
-        v, bounds = self.n_violations, self.bounds
-        kept = np.arange(v, self.program.n_bounds)
-        moves, residual = self.parameter.no_map(self.n_moves), self._free_residual
-        if pattern.all():
-            moves[:] = np.linalg.solve(self.U, self._target)
-        else:
-            kept = self.restricted(pattern).bounds[v:]
-            Q, R = np.linalg.qr(self.U[:, pattern], mode="complete")
-            reached, missed = np.split(Q.T @ self._target, [R.shape[1]])
-            moves[pattern] = np.linalg.solve(R[: R.shape[1]], reached)
-            residual = np.vstack([residual, missed])
-        at_optimum = bounds.of_moves[kept - v] @ moves
+        moves, kept = self.parameter.no_map(self.n_moves), restriction.bounds[self.n_violations :]
+        chosen = moves[restriction.moves] = restriction.optimum(self._target)
+        at_optimum, lower, upper = restriction.rows @ chosen, self.bounds.lower[kept], self.bounds.upper[kept]
         return {
-            "margins": np.concatenate([at_optimum - bounds.lower[kept], bounds.upper[kept] - at_optimum]),
+            "margins": np.concatenate([at_optimum - lower, upper - at_optimum]),
             "moves": moves,
             "inputs": self._u_previous + self.cumulate @ moves,
-            "residual": residual,
+            "residual": np.vstack([self._free_residual, restriction.missed @ self._target]),
         }
 
     def optimum_on(self, pattern: BoolArray) -> PatternOptimum:
         """The optimum without limits where only the moves of `pattern`, shape (n_moves,), may differ from zero."""
-        preview_map, parts = _stacked(**self._optimum_maps(pattern))
+        preview_map, parts = _stacked(**self._optimum_maps(self.restricted(pattern)))
         return PatternOptimum(preview_map, self.parameter.with_constant_reference(preview_map), parts)
 
     def sample(self, parameter: Array, u_previous: Array, frozen: Indices | None = None) -> Sample:
@@ -158,6 +161,11 @@ class CondensedQP:
             scaled = self.bounds.violation_scale * self.violations(sample, moves, faded=True)
             cost += self.problem.output_limit_weight * (scaled.sum() + 0.5 * (scaled @ scaled))
         return float(cost)
+
+    def rounding(self, sample: Sample) -> float:
+        """How far rounding may shift the vector whose squared length is the cost of a plan, in roots of cost."""
+        added = self._error_lengths[len(sample.parameter)].dot(np.abs(sample.parameter))
+        return ROUNDING * float(added + self.lengths.dot(np.abs(sample.moves)))
 
     def violations(self, sample: Sample, moves: Array, *, faded: bool = False) -> Array:
         """Largest predicted excess over its limits of each output over i = 1..np, shape (l,).
@@ -176,47 +184,40 @@ class CondensedQP:
             A least-squares problem in the moves: on any pattern, no moves that keep the limits cost less than its
             optimum there.
         """
-        g, constant = self.relaxed_limits(sample, multipliers)
-        target = -0.5 * np.linalg.solve(self.U.T, g)
-        return LeastSquares(target, constant - float(target.dot(target)))
+        delta, excess = self.plain.program.relaxed(sample.moves, sample.lower, sample.upper, multipliers)
+        return LeastSquares(sample.target + delta, sample.cost + excess)
 
     def relaxed_limits(self, sample: Sample, multipliers: Array) -> tuple[Array, float]:
-        """The same as a linear term g, shape (n_moves,), and constant c, of c + min 1/2 d' H d + g' d."""
-        v, n_simple = self.n_violations, self.program.n_simple
-        g = sample.f + multipliers[n_simple:].dot(self.program.A)
-        g[:n_simple] += multipliers[:n_simple]
-        constant = (
-            sample.constant
-            - np.maximum(multipliers, 0.0).dot(sample.upper)
-            - np.minimum(multipliers, 0.0).dot(sample.lower)
-        )
-        if v:
-            constant -= 0.5 * g[:v].dot(g[:v]) / self.problem.output_limit_weight
-        return g[v:], float(constant)
+        """The same as `linear` gives it."""
+        return self.linear(self.priced(sample, multipliers))
+
+    def linear(self, cost: LeastSquares) -> tuple[Array, float]:
+        """A cost as linear term f, shape (n_moves,), and constant c, of c + f' d + 1/2 d' H d."""
+        return -2 * self.U.T.dot(cost.target), cost.least + float(cost.target.dot(cost.target))
 
     def restricted(self, pattern: BoolArray) -> Restriction:
-        """The program on the moves where `pattern`, shape (n_moves,), is true; the others are zero.
+        """The problem on the moves where `pattern`, shape (n_moves,), is true."""
+        weight = self.problem.output_limit_weight
+        return Restriction(self.U, self.bounds, pattern, weight, self._time_limit)
 
-        Input rows at samples where that input does not move repeat earlier ones and are left out.
+    @cached_property
+    def program(self) -> QuadraticProgram:
+        """The `QuadraticProgram` in z = (violations, d), for methods that change its Hessian.
+
+        Raises:
+            MampcError: a Hessian that is not positive definite to working precision, though U has full rank.
         """
-        v, full = self.n_violations, self.program
-        kept = np.concatenate([np.ones(v, dtype=bool), pattern])
-        columns = np.flatnonzero(kept)
-        move = self.bounds.move_of_bound
-        bound_kept = np.where(move < 0, True, pattern[np.maximum(move, 0)])
-        bound_kept[: full.n_simple] = kept[: full.n_simple]
-        bounds = np.flatnonzero(bound_kept)
-        n_simple = int(kept[: full.n_simple].sum())
-        rows = bounds[n_simple:] - full.n_simple
-        program = QuadraticProgram(full.H[np.ix_(columns, columns)], full.A[np.ix_(rows, columns)], n_simple)
-        return Restriction(program, columns, bounds)
+        v = self.n_violations
+        full = np.zeros((v + self.n_moves, v + self.n_moves))
+        full[:v, :v], full[v:, v:] = self.problem.output_limit_weight * np.eye(v), self.H
+        return QuadraticProgram(full, self.bounds.rows, self.bounds.n_simple)
 
     def closed_loop_poles(self) -> ComplexArray:
         """Poles, shape (n + m,), of model and unlimited receding-horizon law, state (x, u_prev)."""
         model = self.problem.model
         n, m = model.n_states, model.n_inputs
         feedback = self._preview_map[self.parts.moves][:m]
-        of_state = np.hstack([feedback[:, self.parameter.x], feedback[:, self.parameter.u_previous]])
+        of_state = np.hstack([feedback[:, self.parameter.x], feedback[:, self.parameter.u_deviation]])
         B = model.B[:, :m]
         open_loop = np.block([[model.A, B], [np.zeros((m, n)), np.eye(m)]])
         return np.linalg.eigvals(open_loop + np.vstack([B, np.eye(m)]) @ of_state).astype(complex)

@@ -146,7 +146,7 @@ class LimitsNow:
     def applied_to(self, sample: Sample) -> Sample:
         """The sample with these limits for bounds."""
         condensed = self._condensed
-        v, n_simple = condensed.n_violations, condensed.program.n_simple
+        v, n_simple = condensed.n_violations, condensed.bounds.n_simple
         m, l = condensed.problem.model.n_inputs, condensed.problem.model.n_outputs
         lower, upper, u = sample.lower.copy(), sample.upper.copy(), sample.u_previous
         low, high = self.inputs.low.ravel(), self.inputs.high.ravel()

@@ -1,8 +1,10 @@
 """The parameter of a sample: every number that changes from sample to sample, in one vector p.
 
-    p = (x, u_prev, d_u, d_y, v, 1, r)
+    p = (x, u_prev, u_prev - u_op, d_u, d_y, v - v_op, 1, r - y_op)
 
-with r either one reference (l,) that holds over the horizon, or r_0 .. r_np one after the other.
+with r either one reference (l,) that holds over the horizon, or r_0 .. r_np one after the other. Deviations from the
+operating point are taken before anything is multiplied: large responses of an integrator would turn the rounding of
+absolute values into errors.
 """
 
 from __future__ import annotations
@@ -21,21 +23,23 @@ class Parameter:
     Attributes:
         x: state, a slice of n entries, as the others are slices of p.
         u_previous: inputs until now, m entries, in engineering units.
+        u_deviation: the same from the operating point.
         input_disturbance, output_disturbance: m and l entries.
-        measured_disturbance: d entries, in engineering units.
+        measured_disturbance: d entries, from the operating point.
         one: the constant 1.
-        reference: (np + 1) l entries, in engineering units.
+        reference: (np + 1) l entries, from the operating point.
         final_reference: the last l of them.
         size: of p.
+        origin: what is subtracted from engineering units, by the length of p.
     """
 
     def __init__(self, problem: TrackingProblem) -> None:
         model = problem.model
         m, l, self._n_outputs = model.n_inputs, model.n_outputs, model.n_outputs
-        sizes = [model.n_states, m, m, l, len(model.v_op), 1, (problem.prediction_horizon + 1) * l]
+        sizes = [model.n_states, m, m, m, l, len(model.v_op), 1, (problem.prediction_horizon + 1) * l]
         ends = np.cumsum(sizes).tolist()
         (
-            self.x, self.u_previous, self.input_disturbance, self.output_disturbance,
+            self.x, self.u_previous, self.u_deviation, self.input_disturbance, self.output_disturbance,
             self.measured_disturbance, self.one, self.reference,
         ) = (slice(end - size, end) for size, end in zip(sizes, ends, strict=True))  # fmt: skip
         self.size = ends[-1]
@@ -43,6 +47,10 @@ class Parameter:
         usual: tuple[Array, ...] = (np.zeros(m), np.zeros(l), model.v_op, np.ones(1))  # d_u, d_y, v, 1
         self._usual = usual
         self._usual_together = np.concatenate(self._usual)
+        origin = np.zeros(self.size)
+        origin[self.u_deviation], origin[self.measured_disturbance] = model.u_op, model.v_op
+        origin[self.reference] = np.tile(model.y_op, problem.prediction_horizon + 1)
+        self.origin = {len(at): at for at in (origin, origin[: self.reference.start + l])}
 
     def vector(
         self,
@@ -53,11 +61,13 @@ class Parameter:
         input_disturbance: Any = None,
         measured_disturbance: Any = None,
     ) -> Array:
-        """p; the reference has shape (l,) or (np + 1, l), each disturbance may be left out."""
+        """p; all arguments in engineering units, the reference (l,) or (np + 1, l), disturbances may be left out."""
         if reference.ndim == 2:
             reference = reference.ravel()
         if output_disturbance is None and input_disturbance is None and measured_disturbance is None:
-            return np.concatenate((x, u_previous, self._usual_together, reference))
+            vector: Array = np.concatenate((x, u_previous, u_previous, self._usual_together, reference))
+            vector -= self.origin[len(vector)]
+            return vector
         d_u, d_y, v, one = self._usual
         if input_disturbance is not None:
             d_u = as_shaped("input_disturbance", input_disturbance, d_u.shape)
@@ -65,7 +75,9 @@ class Parameter:
             d_y = as_shaped("output_disturbance", output_disturbance, d_y.shape)
         if measured_disturbance is not None:
             v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
-        return np.concatenate((x, u_previous, d_u, d_y, v, one, reference))
+        vector = np.concatenate((x, u_previous, u_previous, d_u, d_y, v, one, reference))
+        vector -= self.origin[len(vector)]
+        return vector
 
     def no_map(self, rows: int) -> Array:
         """A map of p to `rows` zeros, shape (rows, size), to be filled in."""

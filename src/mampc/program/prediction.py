@@ -2,8 +2,8 @@
 
 With the step response S_i = D + sum_{k<i} C A^k B of the model
 
-    y_i = free_i + sum_{j <= min(i, nc-1)} S_{i-j} du_j                                            i = 0..np
-    free_i = y_op + C A^i x + S_i (u_prev + d_u - u_op) + S^v_i (v - v_op) + d_y      (no more moves)
+    y_i - y_op = free_i + sum_{j <= min(i, nc-1)} S_{i-j} du_j                                            i = 0..np
+    free_i = C A^i x + S_i (u_prev - u_op + d_u) + S^v_i (v - v_op) + d_y            (no more moves)
 
 with constant disturbances: d_u at the inputs, d_y at the outputs, and measured ones v with their own step
 response S^v.
@@ -28,7 +28,7 @@ class Prediction:
         step_response: S_0 .. S_np, shape (np + 1, l, m + d), measured disturbances behind the inputs.
         state_response: sum_{k<i} A^k B for i = 0..np, shape (np + 1, n, m + d).
         theta: outputs per move, lower block-triangular, shape ((np + 1) l, nc m).
-        free: a map of the parameter, shape ((np + 1) l, parameter's size).
+        free: outputs without moves, from the operating point, a map of p of shape ((np + 1) l, parameter's size).
 
     Raises:
         MampcError: predictions that leave the numbers, of an unstable model.
@@ -61,8 +61,6 @@ class Prediction:
         of_all_inputs = self.step_response.reshape(-1, model.B.shape[1])
         self.free = free = parameter.no_map((n_p + 1) * l)
         free[:, parameter.x] = observed.reshape(-1, model.n_states)
-        free[:, parameter.u_previous] = free[:, parameter.input_disturbance] = of_all_inputs[:, :m]
+        free[:, parameter.u_deviation] = free[:, parameter.input_disturbance] = of_all_inputs[:, :m]
         free[:, parameter.measured_disturbance] = of_all_inputs[:, m:]
         free[:, parameter.output_disturbance] = np.tile(np.eye(l), (n_p + 1, 1))
-        offset = np.tile(model.y_op, n_p + 1) - of_all_inputs @ model.all_inputs_op
-        free[:, parameter.one] = offset[:, None]

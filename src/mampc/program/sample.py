@@ -26,7 +26,6 @@ class Parts(NamedTuple):
     target: slice = slice(0)
     f: slice = slice(0)
     f_moves: slice = slice(0)
-    error: slice = slice(0)
     lower: slice = slice(0)
     upper: slice = slice(0)
 
@@ -121,16 +120,10 @@ class Sample(Optimum):
         return self.data[self.parts.f_moves]
 
     @property
-    def error(self) -> Array:
-        """Q^(1/2) (r - free), and the weighted tail, shape (n_errors,)."""
-        return self.data[self.parts.error]
-
-    @property
     def constant(self) -> float:
-        """The cost of no moves: |error|^2."""
+        """The cost of no moves."""
         if self._constant is None:
-            error = self.data[self.parts.error]
-            self._constant = float(error.dot(error))
+            self._constant = self.cost + float(self.target.dot(self.target))
         return self._constant
 
     @property
@@ -189,7 +182,7 @@ class PatternOptimum:
         self._maps, self.parts = {m.shape[1]: m for m in (preview_map, constant_map)}, parts
 
     def at(self, sample: Sample) -> Optimum:
-        """Its values for one sample; margins belong to the bounds that `CondensedQP.restricted` keeps, or
+        """Its values for one sample; margins belong to the bounds that a `Restriction` keeps, or
         to all of them where they are this sample's own.
         """
         parameter, bounds_now = sample.parameter, sample.bounds_now

@@ -64,12 +64,12 @@ class SteadyTarget:
         """The target for the parameter p of a sample; with a previewed reference for its last row."""
         at, model = self._parameter, self._problem.model
         n, l = self._shape
-        d_u, v = p[at.input_disturbance], p[at.measured_disturbance] - model.v_op
-        reference = p[-l:]
+        d_u, v = p[at.input_disturbance], p[at.measured_disturbance]
+        reference = p[-l:]  # from the operating point, as v is
         forcing = model.B @ np.concatenate([d_u, v])
         feed = model.D @ np.concatenate([d_u, v])
         particular = self._particular @ forcing
-        missing = self._root @ (reference - model.y_op - p[at.output_disturbance] - feed)
+        missing = self._root @ (reference - p[at.output_disturbance] - feed)
         missing = missing - self._outputs @ particular
         f = -2 * self._weighted.T @ missing + 2 * NEAREST * self._to_u.T @ particular[n:]
         limits = self._problem.limits

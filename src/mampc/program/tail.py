@@ -44,11 +44,9 @@ def tail(problem: TrackingProblem, prediction: Prediction, parameter: Parameter)
     forced = prediction.state_response
     per_input = np.vstack([forced[-1], model.B, -model.D])  # zeta per input held from the first sample on
     zeta = parameter.no_map(2 * n + l)
-    zeta[:, parameter.u_previous] = zeta[:, parameter.input_disturbance] = per_input[:, :m]
+    zeta[:, parameter.u_deviation] = zeta[:, parameter.input_disturbance] = per_input[:, :m]
     zeta[:, parameter.measured_disturbance] = per_input[:, m:]
-    zeta[:, parameter.one] = -(per_input @ model.all_inputs_op)[:, None]
     zeta[:n, parameter.x] = prediction.final_power
-    zeta[2 * n :, parameter.one] -= model.y_op[:, None]
     zeta[2 * n :, parameter.output_disturbance] = -np.eye(l)
     zeta[2 * n :, parameter.final_reference] = np.eye(l)
     of_moves = np.vstack(

@@ -181,7 +181,7 @@ class _Terminal:
             raise MampcError(
                 f"terminal: expected a model whose Riccati equation has a stabilising solution, received: {error}"
             ) from None
-        self._parameter, self._model = parameter, model
+        self._parameter = parameter
         prediction = Prediction(problem, parameter)
         self._root = square_root((P + P.T) / 2)
         response = prediction.state_response
@@ -191,7 +191,7 @@ class _Terminal:
 
     def terms(self, p: Array, steady: Steady) -> tuple[Array, Array]:
         """Linear and quadratic term in the moves."""
-        at, model = self._parameter, self._model
-        applied = np.concatenate([p[at.u_previous] + p[at.input_disturbance], p[at.measured_disturbance]])
-        free = self._power @ p[at.x] + self._response @ (applied - model.all_inputs_op)
+        at = self._parameter
+        applied = np.concatenate([p[at.u_deviation] + p[at.input_disturbance], p[at.measured_disturbance]])
+        free = self._power @ p[at.x] + self._response @ applied
         return 2 * self._of_moves.T @ (self._root @ (free - steady.x)), self._H

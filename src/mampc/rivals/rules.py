@@ -150,10 +150,11 @@ class Predicted(Rule):
 
     def outputs(self, sample: Sample, moves: Array | None = None) -> Array:
         """Predicted outputs y_0 .. y_np with some moves (n_moves,), or none, shape (np + 1, l)."""
-        y: Array = self._free[len(sample.parameter)] @ sample.parameter
+        deviation: Array = self._free[len(sample.parameter)] @ sample.parameter
         if moves is not None:
-            y = y + self.condensed.theta @ moves
-        return y.reshape(-1, self.problem.model.n_outputs)
+            deviation = deviation + self.condensed.theta @ moves
+        y: Array = self.problem.model.y_op + deviation.reshape(-1, self.problem.model.n_outputs)
+        return y
 
 
 class EventTriggered(Predicted):
@@ -205,7 +206,8 @@ class QuietZone(Predicted):
             raise MampcError(f"band: expected values of at least 0, received {band!r}")
 
     def is_due(self, sample: Sample, state: ControllerState) -> bool:
-        reference = sample.parameter[self.condensed.parameter.reference.start :].reshape(-1, len(self._band))
+        deviation = sample.parameter[self.condensed.parameter.reference.start :].reshape(-1, len(self._band))
+        reference = self.problem.model.y_op + deviation
         y = self.outputs(sample)[1:]
         error: BoolArray = np.abs(y - reference[-len(y) :]) > self._band
         return bool(error.any())

@@ -1,12 +1,14 @@
 """All admissible patterns of a small problem, ranked by a bound that needs no solver.
 
-With H the Hessian in the moves and f its linear term, no moves on the pattern S cost less than
+No moves on a pattern S cost less than the optimum without limits there. With d* the free optimum, E the moves that S
+leaves out and V = (I - Q Q') U_E, Q an orthonormal basis of the columns U_S, that is
 
-    -1/2 f_S' H_SS^-1 f_S + price of S        (relative to the cost of no moves)
+    least + |V d*_E|^2 + price of S        least: the cost of the free optimum
 
-and where the optimum on S keeps every limit, this is its cost. The inverses do not change from sample to
-sample: written as a linear function of the products f_i f_k, i <= k, all patterns are ranked by one
-matrix-vector product.
+and where the optimum on S keeps every limit, this is its cost. It is counted upwards from the free optimum, which
+is as exact as the problem is well conditioned; counted downwards from the cost of no moves it would drown in
+rounding. V does not change from sample to sample: written as a linear function of the products x_i x_k, i <= k, of
+x_i = |U_i| d*_i, all patterns are ranked by one matrix-vector product.
 """
 
 from __future__ import annotations
@@ -17,8 +19,8 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
-from mampc.program.condensing import CondensedQP
-from mampc.program.sample import Optimum, PatternOptimum, Sample
+from mampc.program.condensing import ROUNDING, CondensedQP
+from mampc.program.sample import LeastSquares, Optimum, PatternOptimum, Sample
 
 LARGEST_TABLE = 1_000_000  # entries; from here on the tree search is faster
 CACHE_BYTES = 64e6
@@ -45,16 +47,20 @@ class Ranking:
         self.charge = np.array([admissible.charge(pattern) for pattern in self.patterns])
         n = condensed.n_moves
         self._rows, self._columns = np.triu_indices(n)
-        inverses = np.zeros((len(patterns), n, n))
-        for inverse, pattern in zip(inverses, self.patterns, strict=True):
-            chosen = np.flatnonzero(pattern)
-            inverse[np.ix_(chosen, chosen)] = np.linalg.inv(condensed.H[np.ix_(chosen, chosen)])
-        doubled = np.where(self._rows == self._columns, 0.5, 1.0)
-        self._table = np.ascontiguousarray(-inverses[:, self._rows, self._columns] * doubled)
+        doubled = np.where(self._rows == self._columns, 1.0, 2.0)
+        unit_columns = condensed.U / condensed.lengths
         if admissible.sized:
-            self._optima = -inverses.reshape(-1, n)
-            self._stiffness = 1 / np.maximum(inverses[:, np.arange(n), np.arange(n)], 1e-300)
+            self._optima, self._stiffness = np.zeros((len(patterns), n, n)), np.ones((len(patterns), n))
             self._sizes = np.where(self.patterns, admissible.min_size, 0.0)
+        self._table = np.empty((len(patterns), len(self._rows)))
+        for k, pattern in enumerate(self.patterns):
+            restriction = condensed.restricted(pattern)
+            V = restriction.missed @ np.where(pattern, 0.0, unit_columns)
+            self._table[k] = (V.T @ V)[self._rows, self._columns] * doubled
+            if admissible.sized:
+                self._optima[k, pattern] = restriction.optimum(unit_columns)
+                inverse = np.linalg.inv(restriction.R)
+                self._stiffness[k, pattern] = 1 / np.square(inverse).sum(axis=1)
         self._kept: OrderedDict[int, PatternOptimum] = OrderedDict()
         self._most_kept = max(64, int(CACHE_BYTES / condensed.map_bytes))
 
@@ -63,29 +69,37 @@ class Ranking:
         rows = self._rows_within[min(past.left, len(self._rows_within) - 1)]
         return (
             slice(0, rows.stop) if any(past.frozen) else rows
-        )  # inputs at rest may leave part of the budget unspent
+        )  # frozen inputs may leave part of the budget unspent
 
-    def bounds(self, f: Array, past: Allowance) -> Array:
-        """A lower bound for each pattern of `rows` (infinite where the past forbids it), for the linear term f.
+    def bounds(self, free: Array, least: float, past: Allowance) -> Array:
+        """A lower bound for each pattern of `rows`, infinite where the past forbids it.
 
-        Relative to the cost of no moves.
+        Args:
+            free: the free optimum, shape (n_moves,).
+            least: its cost.
+            past: what the applied moves leave.
         """
+        x = free * self.condensed.lengths
         rows = self.rows(past)
-        values: Array = self._table[rows].dot(f.take(self._rows) * f.take(self._columns))
+        values: Array = self._table[rows].dot(x.take(self._rows) * x.take(self._columns))
+        # No entry of the table is larger than 1, so this is all that rounding can add.
+        values += least - len(x) * ROUNDING * float(x.dot(x))
         if self.admissible.priced:
             values += self.charge[rows]
         if self.admissible.sized:
-            values += self._lift(f, rows.stop)
+            values += self._lift(x, rows.stop)
         if any(past.frozen):
             values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
         return values
 
-    def _lift(self, f: Array, end: int) -> Array:
+    def priced(self, cost: LeastSquares, past: Allowance) -> Array:
+        """The same with the limits priced in."""
+        return self.bounds(self.condensed.plain.optimum(cost.target), cost.least, past)
+
+    def _lift(self, x: Array, end: int) -> Array:
         """How much more a pattern costs at least because its optimum has moves below their least size."""
-        n = self.condensed.n_moves
-        optima = self._optima[: end * n].dot(f).reshape(end, n)
-        short = np.maximum(self._sizes[:end] - np.abs(optima), 0.0)
-        lift: Array = 0.5 * (short * short * self._stiffness[:end]).max(axis=1, initial=0.0)
+        short = np.maximum(self._sizes[:end] - np.abs(self._optima[:end].dot(x)), 0.0)
+        lift: Array = (short * short * self._stiffness[:end]).max(axis=1, initial=0.0)
         return lift
 
     def optimum(self, index: int, sample: Sample) -> Optimum:

@@ -18,11 +18,11 @@ from time import perf_counter
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_number
-from mampc.base.tolerances import INSIDE, TIE
+from mampc.base.tolerances import INSIDE, TIE, tie
 from mampc.base.words import Remark, Status
 from mampc.methods.exact.ranking import Ranking, ranking_of
 from mampc.methods.exact.relaxation import Relaxation
-from mampc.methods.exact.tree import PatternTree, Priced
+from mampc.methods.exact.tree import PatternTree
 from mampc.methods.local_search import LocalSearch
 from mampc.methods.method import HELD_BY, Plan
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
@@ -30,7 +30,7 @@ from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.qp import QPStatus
-from mampc.program.sample import Sample
+from mampc.program.sample import LeastSquares, Sample
 
 TOGETHER = 3  # patterns of the table whose limits are priced together
 
@@ -67,9 +67,7 @@ class ExactSearch:
         self.admissible = AdmissiblePatterns(rules, problem.model.n_inputs, problem.control_horizon)
         self._relaxation = Relaxation(condensed)
         self._ranking = ranking_of(condensed, self.admissible)
-        # Ranking calls the solver only where the optimum without limits breaks one.
-        ranked = self._ranking is not None
-        self._solver = PatternSolver(condensed, self.admissible, limits_expected=ranked)
+        self._solver = PatternSolver(condensed, self.admissible)
         if self._ranking is None:
             self._tree = PatternTree(condensed, self.admissible)
             self._local = LocalSearch(condensed, self.admissible)
@@ -85,16 +83,18 @@ class ExactSearch:
         ranking = self._ranking
         if ranking is None:
             return self._search_tree(sample, past)
-        bounds = ranking.bounds(sample.f_moves, past)
-        best = ranking.rows(past).start + int(bounds.argmin())
+        bounds = ranking.bounds(sample.moves, sample.cost, past)
+        best = int(bounds.argmin())
         if not self.admissible.sized:
-            optimum = ranking.optimum(best, sample)
+            at = ranking.rows(past).start + best
+            optimum = ranking.optimum(at, sample)
             margins = optimum.margins
             if not len(margins) or margins[margins.argmin()] > INSIDE:
-                return Plan(
-                    optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs,
-                    optimum.cost + float(ranking.charge[best]),
-                )  # fmt: skip
+                objective = optimum.cost + float(ranking.charge[at])
+                if objective - bounds[best] <= TIE * objective:
+                    return Plan(
+                        optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs, objective,
+                    )  # fmt: skip
         return self._search_ranking(ranking, bounds, sample, past)
 
     def _deadline(self) -> float:
@@ -104,24 +104,22 @@ class ExactSearch:
     def _search_ranking(self, ranking: Ranking, bounds: Array, sample: Sample, past: Allowance) -> Plan:
         """Patterns of the table best bound first, ranked again whenever the limits are priced anew."""
         best, deadline, patterns = Incumbent(), self._deadline(), ranking.patterns[ranking.rows(past)]
-        tie = TIE * max(1e-6, sample.constant)
-        oracle = SampleOracle(self, sample, best, deadline, tie)
-        bounds += sample.constant
+        oracle = SampleOracle(self, sample, best, deadline)
 
-        def rank_again(limits: Priced | None) -> None:
+        def rank_again(limits: LeastSquares | None) -> None:
             if limits is not None:
-                np.maximum(bounds, ranking.bounds(limits[0], past) + limits[1], out=bounds)
+                np.maximum(bounds, ranking.priced(limits, past), out=bounds)
 
         rank_again(oracle.of_plain())
         solved = None
         while True:
             index = int(bounds.argmin())
             bound = float(bounds[index])
-            if bound >= best.objective - tie or bound == np.inf:
+            if bound >= oracle.cutoff or bound == np.inf:
                 return self._plan(sample, best, best.objective)
             if perf_counter() > deadline:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
-            if solved is not None:
+            if solved is not None and solved.multipliers is not None and solved.multipliers.any():
                 rank_again(oracle.priced(solved.multipliers))
                 # Where this pattern does not move, its multipliers say little: price the best ones left together.
                 few = bounds.argpartition(min(TOGETHER, len(bounds) - 1))[:TOGETHER]
@@ -137,17 +135,16 @@ class ExactSearch:
     def _search_tree(self, sample: Sample, past: Allowance) -> Plan:
         """A good plan by local search, then the tree of everything that may beat it."""
         best, deadline = Incumbent(), self._deadline()
-        tie = TIE * max(1e-6, sample.constant)
-        oracle = SampleOracle(self, sample, best, deadline, tie)
-        priced = [(sample.f_moves, sample.constant)]
+        oracle = SampleOracle(self, sample, best, deadline)
+        priced = [sample.least_squares]
         if (limits := oracle.of_plain()) is not None:
             priced.append(limits)
         best.offer(self._solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool)))
-        self._local.offer(self._solver, sample, priced[-1][0], past, best, deadline)
+        self._local.offer(self._solver, sample, self.condensed.linear(priced[-1])[0], past, best, deadline)
         if (limits := oracle.priced(best.multipliers)) is not None:
             priced.append(limits)
-        open_bound = self._tree.search(priced, past, best.objective - tie, deadline, oracle)
-        if open_bound < best.objective - tie:
+        open_bound = self._tree.search(priced, past, oracle.cutoff, deadline, oracle)
+        if open_bound < oracle.cutoff:
             return self._plan(sample, best, open_bound, Status.TIME_LIMIT)
         return self._plan(sample, best, best.objective)
 
@@ -170,29 +167,33 @@ class ExactSearch:
 class SampleOracle:
     """One sample as the searches see it: patterns are solved for, and limits priced, on demand."""
 
-    def __init__(
-        self, search: ExactSearch, sample: Sample, best: Incumbent, deadline: float, tie: float
-    ) -> None:
+    def __init__(self, search: ExactSearch, sample: Sample, best: Incumbent, deadline: float) -> None:
         self._condensed, self._solver, self._relaxation = search.condensed, search._solver, search._relaxation
-        self._instance, self._best, self._deadline, self._tie = sample, best, deadline, tie
-        self._relaxation.begin()
+        self._sample, self._best, self._deadline = sample, best, deadline
+        self._rounding = search.condensed.rounding(sample)
 
-    def leaf(self, pattern: BoolArray) -> tuple[float, Priced | None]:
-        solved = self._solver.solve(self._instance, pattern, self._best.objective, self._deadline)
+    @property
+    def cutoff(self) -> float:
+        """What a plan has to cost less than to be better than the best so far."""
+        return self._best.objective - tie(self._best.objective, self._rounding)
+
+    def leaf(self, pattern: BoolArray) -> tuple[float, LeastSquares | None]:
+        solved = self._solver.solve(self._sample, pattern, self._best.objective, self._deadline)
         self._best.offer(solved)
-        return self._best.objective - self._tie, self.priced(solved.multipliers)
+        return self.cutoff, self.priced(solved.multipliers)
 
-    def of_plain(self) -> Priced | None:
+    def of_plain(self) -> LeastSquares | None:
         """The limits priced in that plain MPC runs into, if any."""
-        if not self._instance.margins.min(initial=np.inf) < 0:
+        if not self._sample.margins.min(initial=np.inf) < 0:
             return None
-        return self.priced(self._relaxation.of_plain(self._instance))
+        sample = self._sample
+        return self.priced(self._condensed.plain.solve(sample.moves, sample.lower, sample.upper).multipliers)
 
-    def relaxed(self, free: BoolArray) -> Priced | None:
-        return self.priced(self._relaxation.multipliers(self._instance, free))
+    def relaxed(self, free: BoolArray) -> LeastSquares | None:
+        return self.priced(self._relaxation.multipliers(self._sample, free))
 
-    def priced(self, multipliers: Array | None) -> Priced | None:
-        """The linear term and constant with limits priced in by multipliers, if any is not zero."""
+    def priced(self, multipliers: Array | None) -> LeastSquares | None:
+        """The cost with limits priced in by multipliers, if any is not zero."""
         if multipliers is None or not multipliers.any():
             return None
-        return self._condensed.relaxed_limits(self._instance, multipliers)
+        return self._condensed.priced(self._sample, multipliers)

@@ -25,13 +25,14 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.program.condensing import CondensedQP
+from mampc.program.sample import LeastSquares
 
 CHUNK = 256  # nodes treated at once
 KEPT_LEVELS = 300  # levels whose matrices are kept, for problems with no more moves than this
 MOST_TERMS = 8  # linear terms that nodes are bounded with
 
 Indices = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
-Priced = tuple[Array, float]  # linear term, shape (n_moves,), and constant with limits priced in
+Priced = LeastSquares  # the cost with limits priced in
 
 
 class Nodes(NamedTuple):
@@ -95,7 +96,7 @@ class PatternTree:
     """The search tree of one problem; `search` runs it for one sample's linear term."""
 
     def __init__(self, condensed: CondensedQP, admissible: AdmissiblePatterns) -> None:
-        self.admissible = admissible
+        self.admissible, self._condensed = admissible, condensed
         self._order = np.flatnonzero(admissible.candidates)
         self.H = condensed.H[np.ix_(self._order, self._order)]
         n = len(self._order)
@@ -112,7 +113,7 @@ class PatternTree:
         """Visit every admissible pattern that may cost less than the cutoff.
 
         Args:
-            priced: the linear term and constant of the cost, and those with limits priced in, if any.
+            priced: the cost, and those with limits priced in, if any.
             past: what the applied moves leave.
             cutoff: patterns at or above it (prices included) are of no interest.
             deadline: of `perf_counter`.
@@ -197,7 +198,8 @@ class PatternTree:
         return np.asarray(bound)
 
     def _terms(self, priced: Priced) -> Terms:
-        return Terms(priced[0][self._order], priced[1], self._U_inverse)
+        f, constant = self._condensed.linear(priced)
+        return Terms(f[self._order], constant, self._U_inverse)
 
     def _pattern(self, chosen: Indices) -> BoolArray:
         """The moves made at nodes `chosen`, shape (n_moves,)."""

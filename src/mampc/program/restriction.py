@@ -1,0 +1,95 @@
+"""The problem with the moves of one pattern alone: all others are zero."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray
+from mampc.program.bounds import Bounds
+from mampc.program.least_distance import LeastDistance, Nearest
+from mampc.program.sample import Indices
+
+
+class Restriction:
+    """The least-squares problem |U d - target|^2 with d zero off a pattern, with and without limits.
+
+    Input rows at samples where that input does not move repeat earlier ones and are left out.
+
+    Attributes:
+        n_violations: how many outputs are limited.
+        moves: the moves of the pattern, in order, shape (k,).
+        bounds: the bounds that are kept, shape (kept,); those of the violations come first.
+        rows: bounded quantities per move, violations left out, shape (kept - violations, k).
+        violations: the same per violation.
+        R: triangular factor of the cost in these moves, shape (k, k).
+        reached, missed: orthonormal rows: what the moves can reach of the target, and what not.
+        bytes: about the memory it takes, its solver included.
+
+    Args:
+        U, bounds: of `CondensedQP`.
+        pattern: shape (n_moves,).
+        weight: of the violations.
+        time_limit: seconds that one program may take; None for no limit.
+    """
+
+    def __init__(
+        self, U: Array, bounds: Bounds, pattern: BoolArray, weight: float, time_limit: float | None = None
+    ) -> None:
+        v = self.n_violations = bounds.n_violations
+        n_simple = bounds.n_simple
+        self.moves, self._n_bounds, self._weight = np.flatnonzero(pattern), bounds.size, weight
+        move = bounds.move_of_bound
+        kept = np.where(move < 0, True, pattern[np.maximum(move, 0)])
+        kept[v:n_simple] = pattern[: n_simple - v]
+        self.bounds: Indices = np.flatnonzero(kept)
+        self.rows = bounds.of_moves[self.bounds[v:] - v][:, self.moves]
+        simple = int(np.count_nonzero(kept[:n_simple])) - v
+        violations = bounds.rows[self.bounds[v + simple :] - n_simple, :v]
+        self.violations = np.vstack([np.zeros((simple, v)), violations])
+        self._time_limit = time_limit
+        k = len(self.moves)
+        if k == len(U):
+            self.R, Q = U, np.eye(k)
+        else:
+            Q, R = np.linalg.qr(U[:, self.moves], mode="complete")
+            self.R = R[:k]
+        self.reached, self.missed = Q[:, :k].T, Q[:, k:].T
+        self._optimum = np.linalg.solve(self.R, self.reached)
+        self.bytes = 4 * (self.rows.nbytes + 20 * len(self.rows)) + 2 * Q.nbytes
+
+    def optimum(self, target: Array) -> Array:
+        """The best moves without limits, shape (k,)."""
+        moves: Array = self._optimum.dot(target)
+        return moves
+
+    def excess(self, target: Array) -> float:
+        """What they cost more than the optimum of all moves."""
+        missed = self.missed.dot(target)
+        return float(missed.dot(missed))
+
+    @cached_property
+    def program(self) -> LeastDistance:
+        """Its program within the bounds that are kept."""
+        return LeastDistance(self.R, self.rows, self.violations, self._weight, time_limit=self._time_limit)
+
+    def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
+        """The best moves within limits.
+
+        Args:
+            optimum: `optimum` of the sample.
+            lower, upper: the bounds that are kept.
+            active: bounds to start from, as `active_bounds` gives them, shape (n_bounds,).
+
+        Returns:
+            As `LeastDistance`, the multipliers of all bounds, shape (n_bounds,).
+        """
+        if active is not None:
+            active = active[self.bounds]
+        nearest = self.program.solve(optimum, lower, upper, active)
+        if nearest.multipliers is None or len(self.bounds) == self._n_bounds:
+            return nearest
+        multipliers = np.zeros(self._n_bounds)
+        multipliers[self.bounds] = nearest.multipliers
+        return nearest._replace(multipliers=multipliers)
