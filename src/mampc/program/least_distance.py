@@ -44,14 +44,22 @@ class LeastDistance:
         rows: bounded quantities per move, shape (b, k).
         violations: the same per violation, shape (b, v).
         weight: w.
+        n_simple: so many first rows are the first moves themselves; active bounds of these are kept exactly.
         time_limit: seconds that a solve may take; None for no limit.
     """
 
     def __init__(
-        self, R: Array, rows: Array, violations: Array, weight: float, *, time_limit: float | None = None
+        self,
+        R: Array,
+        rows: Array,
+        violations: Array,
+        weight: float,
+        *,
+        n_simple: int = 0,
+        time_limit: float | None = None,
     ) -> None:
         v, k = violations.shape[1], len(R)
-        self._v, self._weight, self._rows = v, weight, np.ascontiguousarray(rows)
+        self._v, self._weight, self._rows, self._n_simple = v, weight, np.ascontiguousarray(rows), n_simple
         self._inverse = np.linalg.solve(R, np.eye(k))
         self._per_violation = np.sqrt(2 / weight)  # of its coordinate in which its curvature is 2 as well
         A = np.hstack([violations * self._per_violation, rows @ self._inverse])
@@ -82,9 +90,12 @@ class LeastDistance:
             excess = self._weight * float(a.sum() + 0.5 * a.dot(a))
         excess += float(delta.dot(delta))
         multipliers = solution.multipliers * self._even * scale
-        return Nearest(
-            optimum + self._inverse.dot(delta), excess, multipliers, solution.status, solution.iterations
-        )
+        moves = optimum + self._inverse.dot(delta)
+        simple = slice(v, v + self._n_simple)
+        pull = multipliers[simple]
+        at_bound = np.where(pull > 0, upper[simple], lower[simple])
+        moves[: self._n_simple] = np.where(pull == 0, moves[: self._n_simple], at_bound)
+        return Nearest(moves, excess, multipliers, solution.status, solution.iterations)
 
     def relaxed(self, optimum: Array, lower: Array, upper: Array, multipliers: Array) -> tuple[Array, float]:
         """The optimum with limits priced by multipliers: its delta, and its cost beyond that of the optimum without."""

@@ -45,7 +45,7 @@ class Restriction:
         kept[v:n_simple] = pattern[: n_simple - v]
         self.bounds: Indices = np.flatnonzero(kept)
         self.rows = bounds.of_moves[self.bounds[v:] - v][:, self.moves]
-        simple = int(np.count_nonzero(kept[:n_simple])) - v
+        self._n_simple = simple = int(np.count_nonzero(kept[:n_simple])) - v
         violations = bounds.rows[self.bounds[v + simple :] - n_simple, :v]
         self.violations = np.vstack([np.zeros((simple, v)), violations])
         self._time_limit = time_limit
@@ -72,7 +72,10 @@ class Restriction:
     @cached_property
     def program(self) -> LeastDistance:
         """Its program within the bounds that are kept."""
-        return LeastDistance(self.R, self.rows, self.violations, self._weight, time_limit=self._time_limit)
+        return LeastDistance(
+            self.R, self.rows, self.violations, self._weight,
+            n_simple=self._n_simple, time_limit=self._time_limit,
+        )  # fmt: skip
 
     def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
         """The best moves within limits.
