@@ -34,6 +34,7 @@ from mampc.methods import (
 )
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.systems.mismatch import Mismatch
 from mampc.systems.signals import prbs, steps
 from mampc.systems.state_space import StateSpace, linearise
 
@@ -61,6 +62,7 @@ __all__ = [
     "Limits",
     "MampcError",
     "Metrics",
+    "Mismatch",
     "MoveRules",
     "Names",
     "PenaltyDecomposition",

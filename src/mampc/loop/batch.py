@@ -138,7 +138,8 @@ def simulate_batch(
             )
     courses = [
         course_of(
-            plants[s], regulator, steps=steps, noise=noise, seed=seed, loads=loads, u_initial=u_initial,
+            plants[s], regulator, steps=steps, noise=noise, seed=seed, loads=loads, valves=valves,
+            u_initial=u_initial,
             **{name: value[s] if np.ndim(value) == 3 else value for name, value in own.items()},
         )
         for s, seed in enumerate(seeds)
@@ -151,9 +152,7 @@ def simulate_batch(
     records = _Records(courses, model.n_outputs)
     if plans is None:
         for s in watched(len(seeds), progress):
-            run = closed_loop(
-                plants[s], regulator, courses[s], preview=preview, valves=valves, progress=False
-            )
+            run = closed_loop(plants[s], regulator, courses[s], preview=preview, progress=False)
             records.take(s, run, keep_decisions)
     else:
         parts = [range(s, min(s + TOGETHER, len(seeds))) for s in range(0, len(seeds), TOGETHER)]

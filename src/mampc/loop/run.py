@@ -106,7 +106,7 @@ class Run:
 
     def to_csv(self, path: str | Path) -> None:
         """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs, in
-        full precision.
+        full precision; and where the actuators were, if not where they were told to.
         """
         if len(self.decisions) != len(self.t):
             raise MampcError(
@@ -119,13 +119,17 @@ class Run:
             "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
+        positions: list[list[float]] = [[] for _ in self.t]
+        if not np.array_equal(self.position, self.u):
+            header += [f"{u}_position" for u in inputs]
+            positions = self.position.tolist()
         with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)
-            for row, d in zip(numbers, self.decisions, strict=True):
+            for row, d, position in zip(numbers, self.decisions, positions, strict=True):
                 writer.writerow([
                     *row, d.status.value, d.objective, d.lower_bound, d.iterations,
-                    round(d.solve_time * 1e6, 2), *told(d).values(),
+                    round(d.solve_time * 1e6, 2), *told(d).values(), *position,
                 ])  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from mampc.loop.motion import Faults, motion_of
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.state import RegulatorState
-from mampc.loop.valves import Valves
+from mampc.loop.valves import Stems, Valves
 from mampc.plants import Plant
 from mampc.systems.state_space import StateSpace
 
@@ -63,9 +63,9 @@ def simulate(
     course = course_of(
         plant, regulator, reference, steps=steps, noise=noise, seed=seed,
         input_disturbance=input_disturbance, output_disturbance=output_disturbance,
-        measured_disturbance=measured_disturbance, loads=loads, u_initial=u_initial,
+        measured_disturbance=measured_disturbance, loads=loads, valves=valves, u_initial=u_initial,
     )  # fmt: skip
-    return closed_loop(plant, regulator, course, preview=preview, valves=valves, progress=progress)
+    return closed_loop(plant, regulator, course, preview=preview, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +78,7 @@ class Course:
         at_inputs, at_outputs: unmeasured disturbances, shapes (T, m) and (T, l).
         v: measured disturbances, shape (T, d).
         u_initial: inputs before the first sample, shape (m,).
+        stems: the valves at these inputs; None where inputs are as decided.
     """
 
     reference: Array
@@ -86,6 +87,7 @@ class Course:
     at_outputs: Array
     v: Array
     u_initial: Array
+    stems: Stems | None
 
     def __len__(self) -> int:
         return len(self.noise)
@@ -103,6 +105,7 @@ def course_of(
     output_disturbance: Any,
     measured_disturbance: Any,
     loads: Sequence[Load],
+    valves: Valves | None,
     u_initial: Any,
 ) -> Course:
     """What the arguments of `simulate` say, checked and drawn."""
@@ -130,11 +133,14 @@ def course_of(
     }
     for place, load in drawn(loads, T, model.dt, seed, {place: rows.shape[1] for place, rows in at.items()}):
         at[place] = at[place] + load
+    if not isinstance(valves, Valves | None):
+        raise MampcError(f"valves: expected mampc.Valves, received {type(valves).__name__}")
+    start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
     return Course(
         reference=rows[np.minimum(np.arange(T + horizon), len(rows) - 1)],
         noise=spread * np.random.default_rng(seed).standard_normal((T, l)),
-        at_inputs=at["input"], at_outputs=at["output"], v=at["measured"],
-        u_initial=as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m),
+        at_inputs=at["input"], at_outputs=at["output"], v=at["measured"], u_initial=start,
+        stems=None if valves is None else valves.initial(start),
     )  # fmt: skip
 
 
@@ -144,7 +150,6 @@ def closed_loop(
     course: Course,
     *,
     preview: bool,
-    valves: Valves | None,
     progress: bool | None,
 ) -> Run:
     """The loop sample by sample."""
@@ -156,8 +161,7 @@ def closed_loop(
     shape = (T, len(start))
     inputs, positions, outputs = np.empty(shape), np.empty(shape), np.empty((T, model.n_outputs))
     decisions, found = [], dict[int, Faults]()
-    stem = None if valves is None else valves.initial(start)
-    position = start
+    stems, position = course.stems, start
     for k in watched(T, progress):
         outputs[k] = (
             motion.output(x, np.concatenate([position + course.at_inputs[k], v[k]])) + course.at_outputs[k]
@@ -166,9 +170,9 @@ def closed_loop(
         decision = regulator.step(state, outputs[k] + course.noise[k], ahead, **told[k])
         state, position = decision.state, decision.u
         inputs[k] = decision.u
-        if stem is not None:
-            stem = stem.moved(decision.u)
-            position = stem.position
+        if stems is not None:
+            stems = stems.moved(decision.u)
+            position = stems.position
         positions[k] = position
         decisions.append(decision._replace(state=None))
         applied = np.concatenate([position + course.at_inputs[k], v[k]])

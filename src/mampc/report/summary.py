@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.loop.metrics import Metrics
 from mampc.loop.run import Run
-from mampc.study import StudyResult
+from mampc.study import Study, StudyResult
+from mampc.study.wear import Ratings, ratings_of
 
 
 def summarise(result: StudyResult) -> dict[str, Any]:
     """The content of summary.json: plain numbers, lists and text, no number that JSON cannot hold."""
     study, model, identified = result.study, result.model, result.identified
+    ratings = ratings_of(study, model.n_inputs)
     return {
         "study": study.name,
         "steps": study.steps,
@@ -36,7 +37,7 @@ def summarise(result: StudyResult) -> dict[str, Any]:
                 "controllers": [
                     {
                         "name": table.name,
-                        **_controller(result.runs[scenario.name][table.name], study.threshold, study.skip),
+                        **_controller(result.runs[scenario.name][table.name], study, ratings),
                     }
                     for table in study.controllers
                 ],
@@ -46,11 +47,11 @@ def summarise(result: StudyResult) -> dict[str, Any]:
     }
 
 
-def _controller(run: Run, threshold: float, skip: int) -> dict[str, Any]:
+def _controller(run: Run, study: Study, ratings: Ratings) -> dict[str, Any]:
     microseconds = run.solve_times * 1e6
     return {
-        **_metrics(run.metrics(threshold=threshold)),
-        "without_transient": {"skipped": skip, **_metrics(run.metrics(threshold=threshold, skip=skip))},
+        **_metrics(run, study.threshold, 0, ratings),
+        "without_transient": {"skipped": study.skip, **_metrics(run, study.threshold, study.skip, ratings)},
         "solve_time_us": {
             "median": float(np.median(microseconds)),
             "p99": float(np.percentile(microseconds, 99)),
@@ -73,7 +74,8 @@ def _gap(gaps: Array) -> dict[str, float | None]:
     }
 
 
-def _metrics(metrics: Metrics) -> dict[str, Any]:
+def _metrics(run: Run, threshold: float, skip: int, ratings: Ratings) -> dict[str, Any]:
+    metrics = run.metrics(threshold=threshold, skip=skip, dead_band=ratings.dead_band)
     return {
         "sparse_density": {
             "threshold": metrics.threshold,
@@ -86,4 +88,11 @@ def _metrics(metrics: Metrics) -> dict[str, Any]:
         "moves_per_input": metrics.moves.tolist(),
         "reversals_per_input": metrics.reversals.tolist(),
         "mean_hold_time_per_input": metrics.mean_hold_time.tolist(),
+        "median_hold_time_per_input": metrics.median_hold_time.tolist(),
+        "longest_hold_time_per_input": metrics.longest_hold_time.tolist(),
+        "dead_band_per_input": metrics.dead_band.tolist(),
+        "starts_per_input": metrics.starts.tolist(),
+        "starts_per_hour_per_input": metrics.starts_per_hour.tolist(),
+        "share_of_rated_starts_per_input": ratings.load(metrics.starts_per_hour),
+        "life_years_per_input": ratings.life_years(metrics.starts_per_hour),
     }

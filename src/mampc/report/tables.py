@@ -11,12 +11,14 @@ from mampc.study.schema import ControllerTable, PublishedTable, Study
 
 
 def comparison_tables(study: Study, summary: dict[str, Any]) -> list[Table]:
-    """Two tables a scenario: all samples, and without the first `skip`."""
+    """Tables of each scenario: all samples, without the first `skip`, and what the actuators bear if it has some."""
     tables = []
     for scenario in summary["scenarios"]:
         tables.append(_table(study, scenario, None))
         if study.skip:
             tables.append(_table(study, scenario, "without_transient"))
+        if study.actuators is not None:
+            tables.append(_wear_table(study, scenario))
     return tables
 
 
@@ -64,6 +66,30 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
         if published:
             row += _published_cells(_published(controller, part), _published(base, part))
         table.add_row(*row, f"{times[controller.name]:.0f}")
+    return table
+
+
+def _wear_table(study: Study, scenario: dict[str, Any]) -> Table:
+    """What the actuators bear, one value per input: of all samples."""
+    table = Table(
+        title=escape(f"{study.name}, {scenario['name']} — wear of the actuators"),
+        title_justify="left",
+        title_style="bold",
+    )
+    table.add_column("controller", no_wrap=True)
+    for header in ("travel", "reversals", "starts", "starts\nper hour", "of what\nis rated", "life\nyears"):
+        table.add_column(header, justify="right", no_wrap=True)
+    for entry in scenario["controllers"]:
+        share, life = entry["share_of_rated_starts_per_input"], entry["life_years_per_input"]
+        table.add_row(
+            escape(entry["name"]),
+            " ".join(f"{travel:.4g}" for travel in entry["travel_per_input"]),
+            " ".join(map(str, entry["reversals_per_input"])),
+            " ".join(map(str, entry["starts_per_input"])),
+            " ".join(f"{rate:.3g}" for rate in entry["starts_per_hour_per_input"]),
+            "-" if share is None else " ".join(f"{part:.0%}" for part in share),
+            "-" if life is None else " ".join("∞" if years is None else f"{years:.3g}" for years in life),
+        )
     return table
 
 

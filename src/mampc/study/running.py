@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,13 @@ from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.loop.estimation import KalmanFilter
+from mampc.loop.loads import Load, Residuals
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.sensors import SensorChecks
-from mampc.loop.simulation import at_rest, simulate
+from mampc.loop.simulation import Course, at_rest, closed_loop, course_of
 from mampc.loop.state import RegulatorState
+from mampc.loop.valves import Valves
 from mampc.moves.rules import MoveRules
 from mampc.plants import Plant
 from mampc.program.condensing import CondensedQP
@@ -29,10 +31,13 @@ from mampc.study.plugins import make_plant
 from mampc.study.schema import (
     ControllerTable,
     IdentificationTable,
+    LoadTable,
     ScenarioTable,
     Study,
     Values,
 )
+from mampc.study.wear import ratings_of
+from mampc.systems.mismatch import Mismatch
 from mampc.systems.signals import prbs, steps
 from mampc.systems.state_space import StateSpace
 
@@ -89,7 +94,9 @@ def run_study(
     """
     prepared = prepare(study, on_stage)
     regulators = {table.name: regulator_of(study, prepared.model, table) for table in study.controllers}
-    _reference(study, prepared)  # complains now rather than after the first results
+    ratings_of(study, prepared.model.n_inputs)
+    for scenario in study.scenarios:  # complain now rather than after the first results
+        _course(study, prepared, scenario, next(iter(regulators.values())))
     on_begin(prepared)
     runs: dict[str, dict[str, Run]] = {}
     for scenario in study.scenarios:
@@ -138,34 +145,67 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
 
 def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator) -> Run:
     """One controller in one scenario of a study."""
-    model = prepared.model
-
-    def disturbance(value: Values | None, usual: Any) -> Any:
-        return None if value is None else _disturbance(study, scenario, value, usual)
-
-    return simulate(
-        prepared.plant,
-        regulator,
-        _reference(study, prepared),
-        noise=scenario.noise,
-        seed=scenario.seed,
-        preview=study.reference.preview,
-        input_disturbance=disturbance(scenario.input_disturbance, np.zeros(model.n_inputs)),
-        output_disturbance=disturbance(scenario.output_disturbance, np.zeros(model.n_outputs)),
-        measured_disturbance=disturbance(scenario.measured_disturbance, prepared.v_op),
-        u_initial=prepared.u_op,
-        progress=False,
-    )
+    plant, course = _course(study, prepared, scenario, regulator)
+    return closed_loop(plant, regulator, course, preview=study.reference.preview, progress=False)
 
 
 def initial_state(
     study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator
 ) -> RegulatorState:
     """The state from which `run_controller` starts."""
-    v = prepared.v_op
-    if scenario.measured_disturbance is not None:
-        v = _disturbance(study, scenario, scenario.measured_disturbance, v)[0]
-    return at_rest(prepared.plant, regulator, prepared.u_op, v)[1]
+    plant, course = _course(study, prepared, scenario, regulator)
+    return at_rest(plant, regulator, course.u_initial, course.v[0])[1]
+
+
+def _course(
+    study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator
+) -> tuple[Plant | StateSpace, Course]:
+    """What a scenario makes of the plant, and what acts on it."""
+    model, plant = prepared.model, prepared.plant
+
+    def disturbance(value: Values | None, usual: Any) -> Any:
+        return None if value is None else _disturbance(study, scenario, value, usual)
+
+    if scenario.mismatch is not None:
+        if not isinstance(plant, StateSpace):
+            raise StudyError(
+                f"scenarios, {scenario.name!r}, mismatch: expected a plant that is a model, such as plant.kind = "
+                f"'model', received {study.plant.kind!r}"
+            )
+        plant = Mismatch(**scenario.mismatch.model_dump()).drawn(plant, scenario.seed)
+    try:
+        course = course_of(
+            plant,
+            regulator,
+            _reference(study, prepared),
+            steps=None,
+            noise=scenario.noise,
+            seed=scenario.seed,
+            input_disturbance=disturbance(scenario.input_disturbance, np.zeros(model.n_inputs)),
+            output_disturbance=disturbance(scenario.output_disturbance, np.zeros(model.n_outputs)),
+            measured_disturbance=disturbance(scenario.measured_disturbance, prepared.v_op),
+            loads=[_load(study, model, table) for table in scenario.loads],
+            valves=None if scenario.valves is None else Valves(**scenario.valves.model_dump()),
+            u_initial=prepared.u_op,
+        )
+    except StudyError:
+        raise
+    except MampcError as error:
+        raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
+    return plant, course
+
+
+def _load(study: Study, model: StateSpace, table: LoadTable) -> Load:
+    """The load that a table describes."""
+    if table.file is None:
+        return table.made()
+    names = model.names
+    record = IOData.from_csv(
+        _inside(study.place.folder, table.file, "scenarios.loads.file"),
+        inputs=names.inputs, outputs=names.outputs, disturbances=names.disturbances, dt=model.dt,
+    )  # fmt: skip
+    residuals = Residuals.of(model, record)
+    return residuals if table.at is None else replace(residuals, at=table.at)
 
 
 def _disturbance(study: Study, scenario: ScenarioTable, value: Values, usual: Any) -> Array:
@@ -294,7 +334,7 @@ def _faults(runs: dict[str, dict[str, Run]]) -> tuple[str, ...]:
     )
 
 
-def _inside(folder: Path, name: str) -> Path:
+def _inside(folder: Path, name: str, key: str = "model.file") -> Path:
     """A path named in a study: absolute on purpose, or within the study's folder."""
     path = Path(name)
     if path.is_absolute():
@@ -303,11 +343,9 @@ def _inside(folder: Path, name: str) -> Path:
         resolved = (folder / path).resolve()
         inside = resolved.is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError) as error:  # as for links in circles
-        raise StudyError(
-            f"model.file: expected the path of a file, received {shown(name)}: {error}"
-        ) from None
+        raise StudyError(f"{key}: expected the path of a file, received {shown(name)}: {error}") from None
     if not inside:
         raise StudyError(
-            f"model.file: expected a path within the study's folder (or an absolute one), received {shown(name)}"
+            f"{key}: expected a path within the study's folder (or an absolute one), received {shown(name)}"
         )
     return resolved

@@ -1,0 +1,183 @@
+"""Plants that differ from their model: gains, lags and dead times off by given shares, input by output.
+
+Every pair of input and output is taken apart: its dead time, as many samples as it does not answer; and a state-space
+realisation of the rest from its pulse response (Ho and Kalman), whose time is stretched by way of continuous time. Put
+together again with the dead times as states, they are a model of the same kind.
+
+Source: Ho, Kalman, Regelungstechnik 14 (1966).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, as_number, as_whole
+from mampc.base.errors import MampcError
+from mampc.systems.state_space import StateSpace
+
+NEGLIGIBLE = 1e-9  # of the largest: singular values and pulse responses that are rounding
+SLOWEST_FREE = 1e-6  # poles nearer to zero belong to no lag
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mismatch:
+    """By what shares a plant's gains, lags and dead times may differ from the model's: 0.15 for up to 15 % either way.
+
+    Args:
+        gain: of the gains.
+        lag: of the time constants, below 1.
+        dead_time: of the dead times, below 1; in whole or parts of samples.
+
+    Each pair of input and output draws its own, evenly between the extremes. Poles that belong to no lag, such as
+    negative ones, stay.
+
+    Raises:
+        MampcError: shares out of range.
+    """
+
+    gain: float = 0.0
+    lag: float = 0.0
+    dead_time: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "lag", "dead_time"):
+            share = as_number(name, getattr(self, name), 0.0)
+            if share >= 1:
+                raise MampcError(f"{name}: expected a share below 1, such as 0.15, received {share:g}")
+            object.__setattr__(self, name, share)
+
+    def drawn(self, model: StateSpace, seed: int) -> StateSpace:
+        """A plant off the model by random shares; equal seeds give equal plants.
+
+        Measured disturbances count as inputs. The states are not those of the model.
+
+        Raises:
+            MampcError: a continuous model.
+        """
+        if not isinstance(model, StateSpace) or not model.is_discrete:
+            raise MampcError(f"Mismatch: expected a discrete model, received {model!r}")
+        rng = np.random.default_rng([as_whole("seed", seed, 0), 0x4D49])
+        l, columns = model.D.shape
+        shares = rng.uniform(-1.0, 1.0, (3, l, columns))
+        gains, lags, delays = (
+            1 + share * part
+            for share, part in zip((self.gain, self.lag, self.dead_time), shares, strict=True)
+        )
+        pairs = [
+            [_pair(model, i, j).stretched(lags[i, j], delays[i, j]) for j in range(columns)] for i in range(l)
+        ]
+        A, B, C, D = _together(pairs, gains)
+        names = replace(model.names, states=())
+        return StateSpace(A, B, C, D, model.dt, model.u_op, model.y_op, names, model.v_op)
+
+
+class _Pair(NamedTuple):
+    """One input and output: x+ = A x + early u_{k-q} + late u_{k-q-1}, y = C x + D u_k, q the whole part of `delay`."""
+
+    A: Array
+    early: Array
+    late: Array
+    C: Array
+    D: float
+    delay: float
+
+    def stretched(self, lag: float, dead_time: float) -> _Pair:
+        """With time constants and dead time multiplied."""
+        A, B, C = _stretched(self.A, self.early, self.C, lag)
+        delay = self.delay * dead_time
+        part = delay - np.floor(delay)
+        first, last = _held(A, B, 1 - part)
+        return _Pair(A, first, last, C, self.D, delay)
+
+
+def _pair(model: StateSpace, i: int, j: int) -> _Pair:
+    """Output i and input j of a model, by as few states as it takes."""
+    n = model.n_states
+    pulses, column = [], model.B[:, j]
+    for _ in range(3 * n + 2):
+        pulses.append(float(model.C[i] @ column))
+        column = model.A @ column
+    response = np.array(pulses)
+    answers = np.abs(response) > NEGLIGIBLE * np.abs(response).max(initial=0.0)
+    dead = int(answers.argmax()) if answers.any() and model.D[i, j] == 0 else 0
+    response = response[dead:]
+    rows = len(response) // 2
+    hankel = np.array([response[k : k + rows] for k in range(rows)])
+    shifted = np.array([response[k + 1 : k + 1 + rows] for k in range(rows)])
+    left, size, right = np.linalg.svd(hankel)
+    order = int((size > NEGLIGIBLE * size.max(initial=0.0)).sum()) if answers.any() else 0
+    root = np.sqrt(size[:order])
+    A = (left[:, :order] / root).T @ shifted @ (right[:order].T / root)
+    B, C = root * right[:order, 0], left[0, :order] * root
+    return _Pair(A, B, np.zeros(order), C, float(model.D[i, j]), float(dead))
+
+
+def _stretched(A: Array, B: Array, C: Array, lag: float) -> tuple[Array, Array, Array]:
+    """The same with all time constants multiplied; poles that belong to no lag stay."""
+    if lag == 1.0 or not len(A):
+        return A, B, C
+    from scipy.linalg import expm, logm, schur, solve_sylvester
+
+    def slow(re: float, im: float) -> bool:
+        return bool(abs(complex(re, im)) > SLOWEST_FREE and (re > 0 or abs(im) > SLOWEST_FREE))
+
+    T, Z, count = schur(A, output="real", sort=slow)
+    # Block diagonal: lags first, the rest behind.
+    X = solve_sylvester(T[:count, :count], -T[count:, count:], -T[:count, count:])
+    B, C = Z.T @ B, C @ Z
+    B[:count] -= X @ B[count:]
+    C[count:] = C[:count] @ X + C[count:]
+    T[:count, count:] = 0.0
+    if count:
+        # Over one sample with an input held: exp(F) = [[A, B], [0, 1]], and time runs by 1 / lag of it.
+        held = np.eye(count + 1)
+        held[:count, :count], held[:count, count] = T[:count, :count], B[:count]
+        slowed = np.real(expm(np.real(logm(held)) / lag))
+        T[:count, :count], B[:count] = slowed[:count, :count], slowed[:count, count]
+    return T, B, C
+
+
+def _held(A: Array, B: Array, part: float) -> tuple[Array, Array]:
+    """How an input acts that comes when only the last `part` of a sample is left: then, and in the sample after."""
+    if part == 1.0 or not len(A):
+        return B, np.zeros_like(B)
+    early = part * B
+    if np.abs(np.linalg.eigvals(A)).min() > SLOWEST_FREE:
+        from scipy.linalg import expm, logm
+
+        held = np.eye(len(A) + 1)
+        held[:-1, :-1], held[:-1, -1] = A, B
+        flow = logm(held)
+        if np.isrealobj(flow) or np.abs(flow.imag).max() < NEGLIGIBLE:
+            early = expm(np.real(flow) * part)[:-1, -1]
+    return early, B - early
+
+
+def _together(pairs: list[list[_Pair]], gains: Array) -> tuple[Array, Array, Array, Array]:
+    """One model of all pairs, whose inputs pass through common chains of past values."""
+    l, m = gains.shape
+    chains = [max(int(np.floor(pairs[i][j].delay)) + 1 for i in range(l)) for j in range(m)]
+    orders = [len(pairs[i][j].A) for i in range(l) for j in range(m)]
+    first_pair = sum(chains)
+    n = first_pair + sum(orders)
+    A, B, C, D = np.zeros((n, n)), np.zeros((n, m)), np.zeros((l, n)), np.zeros((l, m))
+    starts = np.cumsum([0, *chains[:-1]])
+    for j, (start, length) in enumerate(zip(starts, chains, strict=True)):
+        B[start, j] = 1.0
+        A[start + 1 : start + length, start : start + length - 1] = np.eye(length - 1)
+    at = first_pair
+    for i in range(l):
+        for j in range(m):
+            pair, gain = pairs[i][j], gains[i, j]
+            own = slice(at, at := at + len(pair.A))
+            whole = int(np.floor(pair.delay))
+            A[own, own], C[i, own], D[i, j] = pair.A, gain * pair.C, gain * pair.D
+            for behind, column in ((whole, pair.early), (whole + 1, pair.late)):
+                if behind == 0:
+                    B[own, j] += column
+                else:
+                    A[own, starts[j] + behind - 1] += column
+    return A, B, C, D
