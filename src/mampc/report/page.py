@@ -13,7 +13,7 @@ body { max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 table { border-collapse: collapse; font-size: 0.85rem; margin: 1rem 0; display: block; overflow-x: auto; }
 th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: right; }
 th:first-child, td:first-child { text-align: left; }
-figure { margin: 1.5rem 0; } figure svg { max-width: 100%; height: auto; }
+figure { margin: 1.5rem 0; } figure svg { width: 100%; max-width: 50rem; height: auto; }
 figcaption { font-size: 0.85rem; color: #555; }
 h1, h2, h3 { line-height: 1.2; }
 """
@@ -59,7 +59,8 @@ class Page:
         body = "\n".join(self._html)
         for number, (mark, path) in enumerate(self._figures.items()):
             body = body.replace(mark, _drawing((folder / path).read_text(encoding="utf-8"), f"f{number}-"))
-        head = f'<meta charset="utf-8"><title>{html.escape(self.title)}</title><style>{STYLE}</style>'
+        head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        head += f"<title>{html.escape(self.title)}</title><style>{STYLE}</style>"
         page = f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
         yield "html", page
 

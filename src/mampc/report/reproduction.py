@@ -89,6 +89,9 @@ def reproduce(directory: Path, on_stage: Callable[[str], None] = lambda stage: N
         _write_case(page, case, folder)
         try:
             StudyFiles(folder, f"{case.study.name}/").page(case.result)
+            page.text(
+                f"The same runs with a slider along moves against error: {case.study.name}/report.html."
+            )
         except MampcError as error:
             on_stage(f"no {case.study.name}/report.html written; {error}")
     _judge(page, cases)
