@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mampc
-from mampc.compare.sweep import SETTINGS, Point
+from mampc.compare.sensitivity import SETTINGS, Point
 from mampc.loop.drawing import signals_figure
 from mampc.report.figures import (
     moves_against_error,

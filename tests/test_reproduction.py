@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from mampc.compare.sweep import Point, holding, sensitivity, varied
+from mampc.compare.sensitivity import Point, holding, sensitivity, varied
 from mampc.report import reproduction
 from mampc.report.page import Page
 from mampc.study import load_study, parse_study, template

@@ -1,155 +1,204 @@
-"""Sensitivity: a study run again with one setting changed at a time, in parallel."""
+"""Sweeps: every controller of a study over the values of its knob, in every scenario, under many seeds."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from mampc.study.running import Prepared, prepare, regulator_of, run_controller
+import numpy as np
+
+from mampc.base.errors import MampcError
+from mampc.compare.fronts import Point
+from mampc.compare.journal import Journal
+from mampc.compare.knobs import variants
+from mampc.study.running import Prepared, prepare, regulator_of, run_seeds
 from mampc.study.schema import ControllerTable, ScenarioTable, Study
 
-SETTINGS = {
-    "move_weight": "move weight lambda",
-    "penalty": "penalty mu",
-    "sparsity_horizon": "sparsity horizon ns",
-    "max_moves": "budget s",
-    "dt": "sample time (s)",
-    "noise": "measurement noise",
-    "reference": "size of the reference steps",
-}
+BASELINE = ControllerTable(name="MPC", method="mpc")
+SCHEDULER_SECONDS = 8  # that a cluster has to answer within
 
 
 @dataclass(frozen=True)
-class Point:
-    """One run with one setting changed: its value, and changes and error as ratios to plain MPC.
+class Task:
+    """One controller with one value of its knob in one scenario, under all seeds."""
 
-    `changes_ratio` counts changes above the threshold of all inputs together; a ratio is None where plain
-    MPC's figure is zero.
-    """
-
-    setting: str
+    scenario: ScenarioTable
+    table: ControllerTable
     value: float
-    changes_ratio: float | None
-    error_ratio: float | None
+
+    @property
+    def name(self) -> str:
+        return f"{self.scenario.name} | {self.table.name} | {self.value:.12g}"
 
 
-def sensitivity(
-    study: Study,
-    scenario: ScenarioTable,
-    sparse: ControllerTable,
-    grid: dict[str, list[float]],
-    *,
-    jobs: int = -1,
-    on_point: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Point]:
-    """Compare one sparse controller with the study's first plain MPC, changing one setting at a time.
+@dataclass(frozen=True)
+class Sweep:
+    """What is swept.
 
     Args:
-        study: holds the settings that stay, and a controller with method "mpc".
-        scenario: noise and disturbances.
-        sparse: the controller to compare.
-        grid: setting -> values, settings named in `SETTINGS`; "reference" scales the steps.
+        study: its controllers, and plain MPC if it has none, in its scenarios.
+        seeds: how many, counted from each scenario's own.
+        points: values of each controller's knob.
+    """
+
+    study: Study
+    seeds: int = 8
+    points: int = 9
+
+    @property
+    def controllers(self) -> list[ControllerTable]:
+        tables = list(self.study.controllers)
+        return tables if any(table.method == "mpc" for table in tables) else [BASELINE, *tables]
+
+    @property
+    def tasks(self) -> list[Task]:
+        """All of them, plain MPC first."""
+        tables = sorted(self.controllers, key=lambda table: table.method != "mpc")
+        return [
+            Task(scenario, changed, value)
+            for scenario in self.study.scenarios
+            for table in tables
+            for value, changed in variants(table, self.points)
+        ]
+
+    @property
+    def runs(self) -> int:
+        return len(self.tasks) * self.seeds
+
+    @property
+    def identity(self) -> str:
+        """What tells this sweep from others."""
+        text = self.study.model_dump_json(exclude={"place"})
+        return hashlib.sha256(f"{text} {self.seeds} {self.points}".encode()).hexdigest()[:16]
+
+
+def run_sweep(
+    sweep: Sweep,
+    folder: Path,
+    *,
+    jobs: int = -1,
+    scheduler: str | None = None,
+    on_task: Callable[[int, int], None] = lambda done, total: None,
+    on_stage: Callable[[str], None] = lambda stage: None,
+) -> list[dict[str, Any]]:
+    """Run what has not been run yet; every finished task is in `folder`/sweep.jsonl at once.
+
+    Args:
+        sweep: what to run.
+        folder: of the journal.
         jobs: processes, -1 for one a core.
-        on_point: called with the number of finished and of all runs.
+        scheduler: address of a Dask scheduler, such as tcp://host:8786, in place of processes here.
+        on_task: called with the number of finished and of all tasks.
+        on_stage: called when a stage begins.
+
+    Returns:
+        One row a run: scenario, controller, method, value, seed, moves, error and what `Metrics` counts.
 
     Raises:
-        MampcError: values that do not fit the study.
+        MampcError: values that do not fit the study, results of another sweep, or a scheduler that is not there.
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    journal = Journal(folder / "sweep.jsonl", sweep.identity)
+    tasks = sweep.tasks
+    missing = [task for task in tasks if task.name not in journal.done]
+    on_task(len(tasks) - len(missing), len(tasks))
+    if missing:
+        prepared = prepare(sweep.study, on_stage)
+        on_stage("running")
+        for number, (task, rows) in enumerate(_results(sweep, prepared, missing, jobs, scheduler), 1):
+            journal.add(task, rows)
+            on_task(len(tasks) - len(missing) + number, len(tasks))
+    return [row for task in tasks for row in journal.done[task.name]]
+
+
+def _results(
+    sweep: Sweep, prepared: Prepared, tasks: list[Task], jobs: int, scheduler: str | None
+) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Each task's name and rows, as they finish."""
+    if scheduler is not None:
+        yield from _on_cluster(sweep, prepared, tasks, scheduler)
+        return
+    if jobs == 1 or len(tasks) == 1:
+        for task in tasks:
+            yield task.name, run_task(sweep, prepared, task)
+        return
     from joblib import Parallel, delayed
 
-    plain = next(table for table in study.controllers if table.method == "mpc")
-    values = [(setting, value) for setting, column in grid.items() for value in column]
-    usual = {setting: _usual(study, scenario, sparse, setting) for setting in grid}
-    # The settings as they are come up in every column and are run once; a model is identified once a dt.
-    tasks = [("dt", study.dt), *((setting, value) for setting, value in values if value != usual[setting])]
-    times = sorted({study.dt, *grid.get("dt", [])})
-    parallel = Parallel(n_jobs=jobs, return_as="generator")
-    models = parallel(delayed(prepare)(study.model_copy(update={"dt": dt})) for dt in times)
-    prepared = dict(zip(times, models, strict=True))
-    work = (
-        delayed(_point)(
-            study, prepared[value if setting == "dt" else study.dt], scenario, plain, sparse, setting, value
-        )
-        for setting, value in tasks
-    )
-    done: dict[tuple[str, float], Point] = {}
-    for task, point in zip(tasks, parallel(work), strict=True):
-        done[task] = point
-        on_point(len(done), len(tasks))
-    as_is = done["dt", study.dt]
-    return [done.get((s, v), replace(as_is, setting=s, value=v)) for s, v in values]
+    parallel = Parallel(n_jobs=jobs, return_as="generator_unordered", max_nbytes=None)
+    yield from parallel(delayed(_named)(sweep, prepared, task) for task in tasks)
 
 
-def _usual(study: Study, scenario: ScenarioTable, sparse: ControllerTable, setting: str) -> Any:
-    """The value that a setting has, None where it is not one number."""
-    own = {
-        "move_weight": study.problem.move_weight,
-        "penalty": sparse.settings.get("penalty"),
-        "dt": study.dt,
-        "noise": scenario.noise,
-        "reference": 1.0,
-    }
-    return own[setting] if setting in own else getattr(sparse.rules, setting)
+def _on_cluster(
+    sweep: Sweep, prepared: Prepared, tasks: list[Task], address: str
+) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """The same on a Dask cluster, which gives the tasks of a lost worker to others."""
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise MampcError("--scheduler: expected the extra mampc[cluster], received none installed") from None
+    try:
+        client = Client(address, timeout=SCHEDULER_SECONDS)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise MampcError(f"--scheduler: expected a Dask scheduler at {address}, received: {error}") from None
+    with client:
+        shared = client.scatter((sweep, prepared), broadcast=True)
+        futures = [client.submit(_shared, shared, task, pure=False, retries=3) for task in tasks]
+        for _, result in as_completed(futures, with_results=True):
+            yield result
 
 
-def _point(
-    study: Study,
-    prepared: Prepared,
-    scenario: ScenarioTable,
-    plain: ControllerTable,
-    sparse: ControllerTable,
-    setting: str,
-    value: float,
-) -> Point:
-    changed, scenario, sparse = varied(study, scenario, sparse, setting, value)
-    figures = []
-    for table in (plain, sparse):
-        regulator = regulator_of(changed, prepared.model, table)
-        metrics = run_controller(changed, prepared, scenario, regulator).metrics(threshold=study.threshold)
-        figures.append((float(metrics.sparse_density.sum()), metrics.tracking_error))
-    (base_changes, base_error), (changes, error) = figures
-    return Point(
-        setting,
-        value,
-        changes / base_changes if base_changes > 0 else None,
-        error / base_error if base_error > 0 else None,
-    )
+def _shared(shared: tuple[Sweep, Prepared], task: Task) -> tuple[str, list[dict[str, Any]]]:
+    return _named(*shared, task)
 
 
-def varied(
-    study: Study, scenario: ScenarioTable, sparse: ControllerTable, setting: str, value: float
-) -> tuple[Study, ScenarioTable, ControllerTable]:
-    """The study, scenario and controller with one setting changed."""
-
-    def within(table: Any, part: str, **changes: Any) -> Any:
-        return table.model_copy(update={part: getattr(table, part).model_copy(update=changes)})
-
-    if setting == "move_weight":
-        return within(study, "problem", move_weight=value), scenario, sparse
-    if setting == "dt":
-        return study.model_copy(update={"dt": value}), scenario, sparse
-    if setting == "reference":
-        changes = [
-            change.model_copy(update={"value": _scaled(change.value, value)})
-            for change in study.reference.changes
-        ]
-        return within(study, "reference", changes=changes), scenario, sparse
-    if setting == "noise":
-        return study, scenario.model_copy(update={"noise": value}), sparse
-    if setting == "penalty":
-        return study, scenario, sparse.model_copy(update={"settings": sparse.settings | {"penalty": value}})
-    return study, scenario, within(sparse, "rules", **{setting: int(value)})
+def _named(sweep: Sweep, prepared: Prepared, task: Task) -> tuple[str, list[dict[str, Any]]]:
+    return task.name, run_task(sweep, prepared, task)
 
 
-def _scaled(values: Any, factor: float) -> Any:
-    return [value * factor for value in values] if isinstance(values, list) else values * factor
+def run_task(sweep: Sweep, prepared: Prepared, task: Task) -> list[dict[str, Any]]:
+    """The rows of one task, one a seed."""
+    study, first = sweep.study, task.scenario.seed
+    regulator = regulator_of(study, prepared.model, task.table)
+    seeds = range(first, first + sweep.seeds)
+    batch = run_seeds(study, prepared, task.scenario, regulator, seeds)
+    rows = []
+    for seed, metrics in zip(seeds, batch.metrics(threshold=study.threshold, skip=study.skip), strict=True):
+        rows.append({
+            "scenario": task.scenario.name, "controller": task.table.name, "method": task.table.method,
+            "value": task.value, "seed": seed, "moves": int(metrics.moves.sum()),
+            "error": metrics.tracking_error, "steps": metrics.steps,
+            "moves_per_hour": float(metrics.moves.sum() * 3600 / (metrics.steps * study.dt)),
+            "reversals": int(metrics.reversals.sum()),
+            **{f"moves_{i}": int(count) for i, count in enumerate(metrics.moves.tolist())},
+            **{f"travel_{i}": float(way) for i, way in enumerate(metrics.travel.tolist())},
+        })  # fmt: skip
+    return rows
 
 
-def holding(points: list[Point], most_error: float) -> Iterator[Point]:
-    """The points at which inputs change less and the error is at most `most_error` times that of MPC."""
-    for point in points:
-        if point.changes_ratio is None or point.error_ratio is None:
-            continue
-        if point.changes_ratio < 1.0 and point.error_ratio <= most_error:
-            yield point
+def points_of(rows: list[dict[str, Any]], scenario: str) -> tuple[Point, dict[str, list[Point]]]:
+    """Plain MPC, and the points of every other controller, in one scenario.
+
+    Raises:
+        MampcError: a table without plain MPC.
+    """
+    grouped: dict[tuple[str, str, float], list[dict[str, Any]]] = {}
+    for row in rows:
+        if row["scenario"] == scenario:
+            grouped.setdefault((row["controller"], row["method"], float(row["value"])), []).append(row)
+    baseline, points = None, dict[str, list[Point]]()
+    for (name, method, value), group in grouped.items():
+        group.sort(key=lambda row: int(row["seed"]))
+        point = Point(
+            name, value, np.array([float(row["moves"]) for row in group]),
+            np.array([float(row["error"]) for row in group]),
+        )  # fmt: skip
+        if method == "mpc" and baseline is None:
+            baseline = point
+        else:
+            points.setdefault(name, []).append(point)
+    if baseline is None:
+        raise MampcError(f"sweep: expected runs of plain MPC in {scenario!r}, received none")
+    return baseline, points

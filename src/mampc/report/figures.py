@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.compare.sweep import Point
+from mampc.compare.sensitivity import Point
 from mampc.identification import IOData, Validation
 from mampc.loop.drawing import (
     BLACK,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mampc.base.errors import MampcError
-from mampc.compare.sweep import SETTINGS, Point, holding, sensitivity
+from mampc.compare.sensitivity import SETTINGS, Point, holding, sensitivity
 from mampc.report.figures import sensitivity_figure, study_figures
 from mampc.report.folder import ResultFolder
 from mampc.report.output import StudyFiles

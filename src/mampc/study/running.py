@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from mampc.base.errors import MampcError, StudyError, shown
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.identification import Identified, IOData, excite, n4sid
+from mampc.loop.batch import Batch, simulate_batch
 from mampc.loop.estimation import KalmanFilter
 from mampc.loop.loads import Load, Residuals
 from mampc.loop.regulator import Regulator
@@ -157,42 +158,64 @@ def initial_state(
     return at_rest(plant, regulator, course.u_initial, course.v[0])[1]
 
 
+def run_seeds(
+    study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator, seeds: Sequence[int]
+) -> Batch:
+    """One controller in one scenario of a study, once a seed of noise, loads and mismatch."""
+    plant: Any = prepared.plant
+    if scenario.mismatch is not None:
+        plant = [_plant(study, prepared, scenario, seed) for seed in seeds]
+    acting = _acting(study, prepared, scenario)
+    try:
+        return simulate_batch(
+            plant, regulator, seeds=seeds, preview=study.reference.preview, progress=False, **acting
+        )
+    except MampcError as error:
+        raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
+
+
 def _course(
     study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator
 ) -> tuple[Plant | StateSpace, Course]:
     """What a scenario makes of the plant, and what acts on it."""
-    model, plant = prepared.model, prepared.plant
+    plant = _plant(study, prepared, scenario, scenario.seed)
+    acting = _acting(study, prepared, scenario)
+    try:
+        return plant, course_of(plant, regulator, steps=None, seed=scenario.seed, **acting)
+    except MampcError as error:
+        raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
+
+
+def _plant(study: Study, prepared: Prepared, scenario: ScenarioTable, seed: int) -> Plant | StateSpace:
+    """The plant, off its model where the scenario says so."""
+    plant = prepared.plant
+    if scenario.mismatch is None:
+        return plant
+    if not isinstance(plant, StateSpace):
+        raise StudyError(
+            f"scenarios, {scenario.name!r}, mismatch: expected a plant that is a model, such as plant.kind = "
+            f"'model', received {study.plant.kind!r}"
+        )
+    return Mismatch(**scenario.mismatch.model_dump()).drawn(plant, seed)
+
+
+def _acting(study: Study, prepared: Prepared, scenario: ScenarioTable) -> dict[str, Any]:
+    """What acts on the loop in a scenario, as `simulate` takes it."""
+    model = prepared.model
 
     def disturbance(value: Values | None, usual: Any) -> Any:
         return None if value is None else _disturbance(study, scenario, value, usual)
 
-    if scenario.mismatch is not None:
-        if not isinstance(plant, StateSpace):
-            raise StudyError(
-                f"scenarios, {scenario.name!r}, mismatch: expected a plant that is a model, such as plant.kind = "
-                f"'model', received {study.plant.kind!r}"
-            )
-        plant = Mismatch(**scenario.mismatch.model_dump()).drawn(plant, scenario.seed)
-    try:
-        course = course_of(
-            plant,
-            regulator,
-            _reference(study, prepared),
-            steps=None,
-            noise=scenario.noise,
-            seed=scenario.seed,
-            input_disturbance=disturbance(scenario.input_disturbance, np.zeros(model.n_inputs)),
-            output_disturbance=disturbance(scenario.output_disturbance, np.zeros(model.n_outputs)),
-            measured_disturbance=disturbance(scenario.measured_disturbance, prepared.v_op),
-            loads=[_load(study, model, table) for table in scenario.loads],
-            valves=None if scenario.valves is None else Valves(**scenario.valves.model_dump()),
-            u_initial=prepared.u_op,
-        )
-    except StudyError:
-        raise
-    except MampcError as error:
-        raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
-    return plant, course
+    return {
+        "reference": _reference(study, prepared),
+        "noise": scenario.noise,
+        "input_disturbance": disturbance(scenario.input_disturbance, np.zeros(model.n_inputs)),
+        "output_disturbance": disturbance(scenario.output_disturbance, np.zeros(model.n_outputs)),
+        "measured_disturbance": disturbance(scenario.measured_disturbance, prepared.v_op),
+        "loads": [_load(study, model, table) for table in scenario.loads],
+        "valves": None if scenario.valves is None else Valves(**scenario.valves.model_dump()),
+        "u_initial": prepared.u_op,
+    }
 
 
 def _load(study: Study, model: StateSpace, table: LoadTable) -> Load:

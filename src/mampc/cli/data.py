@@ -1,184 +1,16 @@
-"""The command line: `mampc run`, `replay`, `reproduce`, `new`, `inspect`, `identify`."""
+"""Commands about records: `inspect`, `identify`."""
 
 from __future__ import annotations
 
 import csv
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from mampc.base.errors import MampcError
-
-app = typer.Typer(
-    name="mampc",
-    help="Minimum-attention model predictive control: track references with few actuator moves.",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-_NARROW = 125  # columns of a table that is not on a terminal
-
-
-def main() -> None:
-    """Run the command line; complaints go to standard error and exit with 2."""
-    try:
-        app()
-    except (MampcError, OSError) as error:  # OSError: such as a name longer than any file's
-        expected = (
-            "" if isinstance(error, MampcError) else "expected a file or folder that can be used, received: "
-        )
-        Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"mampc: {expected}{error}")
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("mampc: interrupted; what had finished is written", file=sys.stderr)
-        sys.exit(130)
-
-
-@app.callback(invoke_without_command=True)
-def _version(
-    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
-) -> None:
-    if version:
-        import mampc
-
-        print(f"mampc {mampc.__version__}")
-        raise typer.Exit
-
-
-@app.command()
-def run(
-    study: Annotated[str, typer.Argument(help="A built-in study (quadruple-tank, sofc) or a TOML file.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME.")
-    ] = None,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
-    ] = False,
-) -> None:
-    """Run a study: identify a model, close the loop with every controller, compare.
-
-    Prints a table and writes summary.json, a CSV of every trajectory, the model, figures (PNG, SVG) and
-    report.html, one page to send on: it needs no other file and no network.
-
-    Examples:
-
-        mampc run quadruple-tank
-
-        mampc run sofc --out results/stack
-
-        mampc run my-study.toml --out results/valves
-    """
-    from mampc.report.output import run_and_write
-    from mampc.report.tables import comparison_tables
-    from mampc.study import load_study
-
-    plan = load_study(study, trust=True if trust else None)
-    directory = Path("results") / Path(study).stem if out is None else out
-    with _progress() as show:
-        result, summary, missing = run_and_write(plan, directory, show)
-    console = _console()
-    for table in comparison_tables(plan, summary):
-        console.print(table)
-        console.print()
-    for warning in result.warnings:
-        _complain(f"warning: {warning}")
-    for note in missing:
-        _complain(f"note: {note}")
-    console.print(f"Results are in {directory}", soft_wrap=True, markup=False)
-
-
-@app.command()
-def replay(
-    run: Annotated[
-        Path, typer.Argument(help="A trajectory that `mampc run` wrote, SCENARIO_CONTROLLER.csv.")
-    ],
-    study: Annotated[
-        str, typer.Option("--study", "-s", help="The study it came from: a name or a TOML file.")
-    ],
-    tolerance: Annotated[
-        float, typer.Option(help="Of inputs and objectives, relative to their size; 0 for the same bits.")
-    ] = 1e-9,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
-    ] = False,
-) -> None:
-    """Decide again on the recorded measurements of a run, and find the first decision that differs.
-
-    The model is the model.json beside the run, if there is one, else it is identified again. Exits with 0 if
-    every decision comes out as recorded, with 1 if one differs.
-
-    Example:
-
-        mampc replay results/quadruple-tank/noisy_exact-price.csv --study quadruple-tank
-    """
-    from mampc.report.replaying import replay_trajectory
-    from mampc.study import load_study
-
-    plan = load_study(study, trust=True if trust else None)
-    with _progress() as show:
-        samples, difference = replay_trajectory(run, plan, tolerance, show)
-    if difference is not None:
-        _console().print(f"{run}: the first difference is at {difference}", soft_wrap=True, markup=False)
-        raise typer.Exit(1)
-    _console().print(f"{run}: all {samples} decisions come out as recorded", soft_wrap=True, markup=False)
-
-
-@app.command()
-def reproduce(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and all results.")] = Path(
-        "results/reproduction"
-    ),
-) -> None:
-    """Run both case studies of the paper and put its results beside ours on one page.
-
-    Writes report.md and a self-contained report.html: the paper's tables and figures redrawn, how the
-    ratios to MPC move with the settings that the paper leaves open, and where its claim holds.
-
-    Example:
-
-        mampc reproduce --out results/paper
-    """
-    from mampc.report.reproduction import reproduce as run_all
-    from mampc.report.tables import comparison_tables
-
-    with _progress() as show:
-        cases = run_all(out, show)
-    console = _console()
-    for case in cases:
-        for table in comparison_tables(case.study, case.summary):
-            console.print(table)
-            console.print()
-        for warning in case.result.warnings:
-            _complain(f"warning: {warning}")
-    console.print(f"Open {out / 'report.html'}", soft_wrap=True)
-
-
-@app.command()
-def new(path: Annotated[Path, typer.Argument(help="File to write; must not exist yet.")]) -> None:
-    """Write a commented study to start your own from.
-
-    Example:
-
-        mampc new my-study.toml && mampc run my-study.toml
-    """
-    from mampc.study import template
-
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(template())
-    except FileExistsError:
-        raise MampcError(f"new: expected a file that does not exist yet, received {path}") from None
-    except OSError as error:
-        raise MampcError(f"new: expected a file that can be written, received: {error}") from None
-    _console().print(f"Wrote {path}; edit it, then run: mampc run {path}", soft_wrap=True)
-
+from mampc.cli.app import app
+from mampc.cli.console import complain, console_for_tables, print_list, progress
 
 Inputs = Annotated[str, typer.Option(help="Input columns, separated by commas.")]
 Outputs = Annotated[str, typer.Option(help="Output columns, separated by commas.")]
@@ -244,7 +76,7 @@ def inspect(
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
     )  # fmt: skip
     target = export.parent / f"{export.stem}-columns.png" if out is None else out
-    with _progress() as show:
+    with progress() as show:
         show("reading the file")
         seen = inspect_export(export, **reading)
         missing = None
@@ -254,7 +86,7 @@ def inspect(
                 save_figure(inspection_figure(seen), target.with_suffix(""))
         except MampcError as error:
             missing = str(error)
-    console = _console()
+    console = console_for_tables()
     if seen.columns:
         console.print(inspection_table(seen))
     for line in inspection_words(seen):
@@ -264,9 +96,9 @@ def inspect(
         ("Missing in the movement of inputs", seen.excitation),
         ("To decide before a model can be identified", seen.doubts),
     ):
-        _print_list(console, title, sentences)
+        print_list(console, title, sentences)
     if missing is not None:
-        _complain(f"note: no figure written; {missing}")
+        complain(f"note: no figure written; {missing}")
     elif seen.columns:
         console.print(f"Wrote {target.with_suffix('.png')} and .svg", soft_wrap=True, markup=False)
 
@@ -322,7 +154,7 @@ def identify(
     settings = {
         "order": order, "weighting": weighting, "block_rows": block_rows, "feedthrough": feedthrough,
     }  # fmt: skip
-    with _progress() as show:
+    with progress() as show:
         outcome = identify_and_write(
             exports,
             target,
@@ -331,9 +163,9 @@ def identify(
             settings=settings,
             share=share,
         )
-    console = _console()
+    console = console_for_tables()
     identified = outcome.identified
-    _print_list(console, "Noticed in the export", outcome.notes)
+    print_list(console, "Noticed in the export", outcome.notes)
     if len(outcome.records) > 1:
         lengths = ", ".join(map(str, outcome.records[:8])) + (", ..." if len(outcome.records) > 8 else "")
         console.print(f"Estimated on {len(outcome.records)} pieces of {lengths} samples", soft_wrap=True)
@@ -345,7 +177,7 @@ def identify(
             f"{identified.integrators} of its poles integrate: they are exactly one", soft_wrap=True
         )
     for warning in outcome.warnings:
-        _complain(f"warning: {warning}")
+        complain(f"warning: {warning}")
     console.print(f"Wrote {target}", soft_wrap=True, markup=False)
 
 
@@ -366,35 +198,16 @@ def _reading(
     return words | plain | {"bad": bad or (), "good": good or (), "ranges": limits}
 
 
-def _print_list(console: Console, title: str, sentences: Sequence[str]) -> None:
-    if sentences:
-        console.print(f"{title}:", markup=False)
-        for sentence in sentences:
-            console.print(f"  - {sentence}", soft_wrap=True, markup=False)
+def _is_model(path: Path) -> bool:
+    from mampc.systems.state_space import StateSpace
+
+    try:
+        StateSpace.load(path)
+    except MampcError:
+        return False
+    return True
 
 
 def _words(text: str) -> list[str]:
     """Words between commas; one that holds a comma stands in quotation marks."""
     return [word.strip() for row in csv.reader([text], skipinitialspace=True) for word in row if word.strip()]
-
-
-def _console() -> Console:
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=max(_NARROW, console.width))
-    return console
-
-
-def _complain(message: str) -> None:
-    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(message)
-
-
-@contextmanager
-def _progress() -> Iterator[Any]:
-    """A function that shows the current stage: a spinner on a terminal, a line each elsewhere."""
-    console = Console(stderr=True, highlight=False, markup=False)
-    if not console.is_terminal:
-        yield lambda stage: None if stage.startswith(("figure", "report.html")) else _complain(f"{stage} ...")
-        return
-    with console.status("") as status:
-        yield lambda stage: status.update(f"{stage} ...")

@@ -1,0 +1,62 @@
+"""What commands say: results on standard output, progress and complaints on standard error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+
+_NARROW = 125  # columns of a table that is not on a terminal
+
+
+def console_for_tables() -> Console:
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=max(_NARROW, console.width))
+    return console
+
+
+def complain(message: str) -> None:
+    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(message)
+
+
+def print_list(console: Console, title: str, sentences: Sequence[str]) -> None:
+    if sentences:
+        console.print(f"{title}:", markup=False)
+        for sentence in sentences:
+            console.print(f"  - {sentence}", soft_wrap=True, markup=False)
+
+
+@contextmanager
+def progress() -> Iterator[Any]:
+    """A function that shows the current stage: a spinner on a terminal, a line each elsewhere."""
+    console = Console(stderr=True, highlight=False, markup=False)
+    if not console.is_terminal:
+        yield lambda stage: None if stage.startswith(("figure", "report.html")) else complain(f"{stage} ...")
+        return
+    with console.status("") as status:
+        yield lambda stage: status.update(f"{stage} ...")
+
+
+@contextmanager
+def bar(title: str) -> Iterator[Any]:
+    """A function that shows how many of all tasks are done, with the time left; a line now and then elsewhere."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True, highlight=False, markup=False)
+    if not console.is_terminal:
+        shown = [0]
+
+        def tell(done: int, total: int) -> None:
+            if done >= shown[0] or done == total:
+                complain(f"{done} of {total} settings done")
+                shown[0] = done + max(1, total // 5)
+
+        yield tell
+        return
+    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(title)
+        yield lambda done, total: progress.update(task, completed=done, total=total)

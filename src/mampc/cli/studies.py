@@ -1,0 +1,144 @@
+"""Commands about studies: `run`, `replay`, `reproduce`, `new`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mampc.base.errors import MampcError
+from mampc.cli.app import app
+from mampc.cli.console import complain, console_for_tables, progress
+
+
+@app.command()
+def run(
+    study: Annotated[str, typer.Argument(help="A built-in study (quadruple-tank, sofc) or a TOML file.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME.")
+    ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
+    ] = False,
+) -> None:
+    """Run a study: identify a model, close the loop with every controller, compare.
+
+    Prints a table and writes summary.json, a CSV of every trajectory, the model, figures (PNG, SVG) and
+    report.html, one page to send on: it needs no other file and no network.
+
+    Examples:
+
+        mampc run quadruple-tank
+
+        mampc run sofc --out results/stack
+
+        mampc run my-study.toml --out results/valves
+    """
+    from mampc.report.output import run_and_write
+    from mampc.report.tables import comparison_tables
+    from mampc.study import load_study
+
+    plan = load_study(study, trust=True if trust else None)
+    directory = Path("results") / Path(study).stem if out is None else out
+    with progress() as show:
+        result, summary, missing = run_and_write(plan, directory, show)
+    console = console_for_tables()
+    for table in comparison_tables(plan, summary):
+        console.print(table)
+        console.print()
+    for warning in result.warnings:
+        complain(f"warning: {warning}")
+    for note in missing:
+        complain(f"note: {note}")
+    console.print(f"Results are in {directory}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def replay(
+    run: Annotated[
+        Path, typer.Argument(help="A trajectory that `mampc run` wrote, SCENARIO_CONTROLLER.csv.")
+    ],
+    study: Annotated[
+        str, typer.Option("--study", "-s", help="The study it came from: a name or a TOML file.")
+    ],
+    tolerance: Annotated[
+        float, typer.Option(help="Of inputs and objectives, relative to their size; 0 for the same bits.")
+    ] = 1e-9,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
+    ] = False,
+) -> None:
+    """Decide again on the recorded measurements of a run, and find the first decision that differs.
+
+    The model is the model.json beside the run, if there is one, else it is identified again. Exits with 0 if
+    every decision comes out as recorded, with 1 if one differs.
+
+    Example:
+
+        mampc replay results/quadruple-tank/noisy_exact-price.csv --study quadruple-tank
+    """
+    from mampc.report.replaying import replay_trajectory
+    from mampc.study import load_study
+
+    plan = load_study(study, trust=True if trust else None)
+    with progress() as show:
+        samples, difference = replay_trajectory(run, plan, tolerance, show)
+    if difference is not None:
+        console_for_tables().print(
+            f"{run}: the first difference is at {difference}", soft_wrap=True, markup=False
+        )
+        raise typer.Exit(1)
+    console_for_tables().print(
+        f"{run}: all {samples} decisions come out as recorded", soft_wrap=True, markup=False
+    )
+
+
+@app.command()
+def reproduce(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the page and all results.")] = Path(
+        "results/reproduction"
+    ),
+) -> None:
+    """Run both case studies of the paper and put its results beside ours on one page.
+
+    Writes report.md and a self-contained report.html: the paper's tables and figures redrawn, how the
+    ratios to MPC move with the settings that the paper leaves open, and where its claim holds.
+
+    Example:
+
+        mampc reproduce --out results/paper
+    """
+    from mampc.report.reproduction import reproduce as run_all
+    from mampc.report.tables import comparison_tables
+
+    with progress() as show:
+        cases = run_all(out, show)
+    console = console_for_tables()
+    for case in cases:
+        for table in comparison_tables(case.study, case.summary):
+            console.print(table)
+            console.print()
+        for warning in case.result.warnings:
+            complain(f"warning: {warning}")
+    console.print(f"Open {out / 'report.html'}", soft_wrap=True)
+
+
+@app.command()
+def new(path: Annotated[Path, typer.Argument(help="File to write; must not exist yet.")]) -> None:
+    """Write a commented study to start your own from.
+
+    Example:
+
+        mampc new my-study.toml && mampc run my-study.toml
+    """
+    from mampc.study import template
+
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(template())
+    except FileExistsError:
+        raise MampcError(f"new: expected a file that does not exist yet, received {path}") from None
+    except OSError as error:
+        raise MampcError(f"new: expected a file that can be written, received: {error}") from None
+    console_for_tables().print(f"Wrote {path}; edit it, then run: mampc run {path}", soft_wrap=True)
