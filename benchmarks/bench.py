@@ -5,7 +5,8 @@
 Every row states a target and what was measured. Both sides of a ratio run in short interleaved blocks,
 so that whatever else the machine does hits both alike; the figure is the median over blocks of the
 ratio of the blocks' median times per call. To add a row, write a function that returns a `Row` and
-append it to `ROWS`. `measuring` says how times are taken, `sparse` has the rows of the exact method and heuristics.
+append it to `ROWS`. `measuring` says how times are taken, `sparse` has the rows of the exact method and heuristics,
+`batches` those of many loops.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import batches
 import mampc
 import sparse
 from measuring import LAMBDA, Asked, Row, closed_loop, interleaved, steps_of, tank_problem
@@ -183,6 +185,7 @@ ROWS: list[Callable[[], Row]] = [
     partial(mpc_against_bare_daqp, bounds=True),
     regulator_against_mpc,
     alternating_against_cvxpy,
+    *batches.ROWS,
     *sparse.ROWS,
     import_time,
 ]

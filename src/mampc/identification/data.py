@@ -166,11 +166,12 @@ def excite(
     dt = as_number("dt", dt, 0.0, exclusive=True)
     names, l = plant.names, len(plant.names.outputs)
     signal = _column("u", u)
-    if signal.shape[1] == len(names.inputs) and not isinstance(plant, StateSpace):
+    if signal.shape[1] == len(names.inputs):
         names = names.undisturbed()
     signal = as_matrix("u", signal, None, len(names.inputs) + len(names.disturbances))
     if isinstance(plant, StateSpace):
-        y = plant.response(signal, x0)
+        rest = np.tile(plant.v_op, (len(signal), 1))[:, : plant.B.shape[1] - signal.shape[1]]
+        y = plant.response(np.hstack([signal, rest]), x0)
     else:
         x = as_array("x0", plant.steady_state(getattr(plant, "u_op", signal[0])) if x0 is None else x0)
         x = as_vector("x0", x, len(plant.names.states) or x.size)

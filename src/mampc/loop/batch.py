@@ -20,7 +20,7 @@ from mampc.loop.motion import Faults, motions_of
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.sensors import SensorState
-from mampc.loop.simulation import Course, at_rest, closed_loop, course_of, watched
+from mampc.loop.simulation import Acting, Course, acting_on, at_rest, closed_loop, watched
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.plants import Plant
@@ -136,14 +136,19 @@ def simulate_batch(
             raise MampcError(
                 f"{name}: expected a course for each of {len(seeds)} seeds, received {len(value)}"
             )
-    courses = [
-        course_of(
-            plants[s], regulator, steps=steps, noise=noise, seed=seed, loads=loads, valves=valves,
-            u_initial=u_initial,
-            **{name: value[s] if np.ndim(value) == 3 else value for name, value in own.items()},
-        )
-        for s, seed in enumerate(seeds)
-    ]  # fmt: skip
+    acting: list[Acting] = []
+    for s in range(len(seeds)):
+        if s and plants[s] is plants[0] and not any(np.ndim(value) == 3 for value in own.values()):
+            acting.append(acting[0])
+            continue
+        one = {name: value[s] if np.ndim(value) == 3 else value for name, value in own.items()}
+        acting.append(
+            acting_on(
+                plants[s], regulator, steps=steps, noise=noise, loads=loads, valves=valves, u_initial=u_initial,
+                **one,
+            )
+        )  # fmt: skip
+    courses = [one.drawn(seed) for one, seed in zip(acting, seeds, strict=True)]
     everyday = type(regulator) is Regulator and type(regulator.estimator) is KalmanFilter
     plans = None
     if everyday and not as_flag("keep_decisions", keep_decisions):

@@ -60,11 +60,11 @@ def simulate(
     Raises:
         MampcError: arguments that do not fit together, or a plant that cannot be integrated.
     """
-    course = course_of(
-        plant, regulator, reference, steps=steps, noise=noise, seed=seed,
+    course = acting_on(
+        plant, regulator, reference, steps=steps, noise=noise,
         input_disturbance=input_disturbance, output_disturbance=output_disturbance,
         measured_disturbance=measured_disturbance, loads=loads, valves=valves, u_initial=u_initial,
-    )  # fmt: skip
+    ).drawn(seed)  # fmt: skip
     return closed_loop(plant, regulator, course, preview=preview, progress=progress)
 
 
@@ -93,22 +93,54 @@ class Course:
         return len(self.noise)
 
 
-def course_of(
+@dataclass(frozen=True, eq=False)
+class Acting:
+    """What acts on a loop of T samples from outside, before anything random in it is drawn.
+
+    Attributes:
+        dt: sample time in seconds.
+        reference, u_initial, stems: as in `Course`.
+        spread: standard deviation of the noise, shape (l,).
+        at: disturbances by place, shapes (T, m), (T, l) and (T, d).
+        loads: to be drawn.
+    """
+
+    dt: float
+    reference: Array
+    spread: Array
+    at: dict[str, Array]
+    loads: Sequence[Load]
+    u_initial: Array
+    stems: Stems | None
+
+    def drawn(self, seed: int) -> Course:
+        """With noise and loads of a seed."""
+        at, seed = dict(self.at), as_whole("seed", seed, 0)
+        T = len(at["output"])
+        signals = {place: rows.shape[1] for place, rows in at.items()}
+        for place, load in drawn(self.loads, T, self.dt, seed, signals):
+            at[place] = at[place] + load
+        noise = self.spread * np.random.default_rng(seed).standard_normal((T, len(self.spread)))
+        return Course(
+            self.reference, noise, at["input"], at["output"], at["measured"], self.u_initial, self.stems
+        )
+
+
+def acting_on(
     plant: Plant | StateSpace,
     regulator: Regulator,
     reference: Any,
     *,
     steps: int | None,
     noise: Any,
-    seed: int,
     input_disturbance: Any,
     output_disturbance: Any,
     measured_disturbance: Any,
     loads: Sequence[Load],
     valves: Valves | None,
     u_initial: Any,
-) -> Course:
-    """What the arguments of `simulate` say, checked and drawn."""
+) -> Acting:
+    """What the arguments of `simulate` say, checked."""
     if not isinstance(regulator, Regulator):
         raise MampcError(f"regulator: expected a mampc.Regulator, received {type(regulator).__name__}")
     model = regulator.controller.problem.model
@@ -124,23 +156,18 @@ def course_of(
     spread = as_vector("noise", noise, l)
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
-    seed = as_whole("seed", seed, 0)
     usual = getattr(plant, "v_op", np.zeros(d))
     at = {
         "input": _trajectory("input_disturbance", _default(input_disturbance, 0.0), m, T),
         "output": _trajectory("output_disturbance", _default(output_disturbance, 0.0), l, T),
         "measured": _trajectory("measured_disturbance", _default(measured_disturbance, usual), d, T),
     }
-    for place, load in drawn(loads, T, model.dt, seed, {place: rows.shape[1] for place, rows in at.items()}):
-        at[place] = at[place] + load
     if not isinstance(valves, Valves | None):
         raise MampcError(f"valves: expected mampc.Valves, received {type(valves).__name__}")
     start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
-    return Course(
-        reference=rows[np.minimum(np.arange(T + horizon), len(rows) - 1)],
-        noise=spread * np.random.default_rng(seed).standard_normal((T, l)),
-        at_inputs=at["input"], at_outputs=at["output"], v=at["measured"], u_initial=start,
-        stems=None if valves is None else valves.initial(start),
+    return Acting(
+        dt=model.dt, reference=rows[np.minimum(np.arange(T + horizon), len(rows) - 1)], spread=spread, at=at,
+        loads=loads, u_initial=start, stems=None if valves is None else valves.initial(start),
     )  # fmt: skip
 
 

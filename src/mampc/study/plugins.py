@@ -11,15 +11,18 @@ import sys
 import traceback
 from typing import Any
 
+import numpy as np
+
 from mampc.base.errors import MampcError, StudyError
 from mampc.base.names import Names
 from mampc.plants import Plant
-from mampc.study.schema import PLANTS, Study
+from mampc.study.schema import PLANTS, SAMPLED, Study
+from mampc.systems.state_space import StateSpace
 
 MEMBERS = ("names", "derivative", "output", "steady_state")
 
 
-def make_plant(study: Study) -> Plant:
+def make_plant(study: Study) -> Plant | StateSpace:
     """The plant that a study names, with its parameters.
 
     Raises:
@@ -28,8 +31,9 @@ def make_plant(study: Study) -> Plant:
     """
     kind = study.plant.kind
     maker = PLANTS[kind] if kind in PLANTS else _imported(study)
+    sampled = {"dt": study.dt} if kind in SAMPLED else {}
     try:
-        plant: Plant = maker(**study.plant.parameters)
+        plant: Plant | StateSpace = maker(**study.plant.parameters, **sampled)
         missing = [member for member in MEMBERS if not hasattr(plant, member)]
     except TypeError as error:
         raise StudyError(f"plant.parameters: expected parameters of {kind}, received: {error}") from None
@@ -37,6 +41,10 @@ def make_plant(study: Study) -> Plant:
         raise StudyError(f"plant.parameters: {error}") from None
     except (Exception, SystemExit) as error:
         raise StudyError(f"plant.kind: expected that {kind} can be made, received {_told(error)}") from None
+    if isinstance(plant, StateSpace):
+        if not np.isclose(plant.dt, study.dt, rtol=1e-6):
+            raise StudyError(f"dt: expected the {plant.dt:g} s of the plant {kind}, received {study.dt:g} s")
+        return plant
     if missing or not isinstance(plant.names, Names):
         raise StudyError(
             f"plant.kind: expected a class with members {', '.join(MEMBERS)} (names a mampc.Names), "

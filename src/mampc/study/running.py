@@ -20,7 +20,7 @@ from mampc.loop.loads import Load, Residuals
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.sensors import SensorChecks
-from mampc.loop.simulation import Course, at_rest, closed_loop, course_of
+from mampc.loop.simulation import Course, acting_on, at_rest, closed_loop
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.moves.rules import MoveRules
@@ -181,7 +181,7 @@ def _course(
     plant = _plant(study, prepared, scenario, scenario.seed)
     acting = _acting(study, prepared, scenario)
     try:
-        return plant, course_of(plant, regulator, steps=None, seed=scenario.seed, **acting)
+        return plant, acting_on(plant, regulator, steps=None, **acting).drawn(scenario.seed)
     except MampcError as error:
         raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
 
@@ -262,7 +262,9 @@ def _operating_point(study: Study, plant: Plant | StateSpace) -> tuple[Array, Ar
     return as_vector("plant.operating_inputs", u_op, m), as_vector("v_op", getattr(plant, "v_op", 0.0), d)
 
 
-def _record(plant: Plant, u_op: Array, v_op: Array, table: IdentificationTable, dt: float) -> IOData:
+def _record(
+    plant: Plant | StateSpace, u_op: Array, v_op: Array, table: IdentificationTable, dt: float
+) -> IOData:
     """Excite the inputs, and the measured disturbances if an amplitude is given for them too."""
     mean = u_op
     if isinstance(table.amplitude, list) and len(table.amplitude) == len(u_op) + len(v_op):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -24,11 +25,15 @@ from mampc.loop.loads import Load
 from mampc.loop.valves import Valves
 from mampc.methods.registry import METHODS, method_of
 from mampc.moves.rules import MoveRules
-from mampc.plants import QuadrupleTank, SolidOxideFuelCell
+from mampc.plants import Level, QuadrupleTank, SolidOxideFuelCell, VanDeVusse, ogunnaike_ray, wood_berry
 from mampc.program.problem import LONGEST_HORIZON
 from mampc.rivals.registry import RIVALS, RULES, check_settings
 
-PLANTS: dict[str, type[Any]] = {"quadruple-tank": QuadrupleTank, "sofc": SolidOxideFuelCell}
+PLANTS: dict[str, Callable[..., Any]] = {
+    "quadruple-tank": QuadrupleTank, "sofc": SolidOxideFuelCell, "van-de-vusse": VanDeVusse, "level": Level,
+    "wood-berry": wood_berry, "ogunnaike-ray": ogunnaike_ray,
+}  # fmt: skip
+SAMPLED = ("wood-berry", "ogunnaike-ray")  # models, made for the study's sample time
 PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 LONGEST_RUN = 1_000_000  # samples
 LONGEST_EXCITATION = 100_000  # samples

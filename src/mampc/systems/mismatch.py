@@ -10,16 +10,13 @@ Source: Ho, Kalman, Regelungstechnik 14 (1966).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError
+from mampc.systems.pairs import NEGLIGIBLE, SLOWEST_FREE, Pair, delayed, joined
 from mampc.systems.state_space import StateSpace
-
-NEGLIGIBLE = 1e-9  # of the largest: singular values and pulse responses that are rounding
-SLOWEST_FREE = 1e-6  # poles nearer to zero belong to no lag
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,33 +64,20 @@ class Mismatch:
             for share, part in zip((self.gain, self.lag, self.dead_time), shares, strict=True)
         )
         pairs = [
-            [_pair(model, i, j).stretched(lags[i, j], delays[i, j]) for j in range(columns)] for i in range(l)
+            [_off(_pair(model, i, j), lags[i, j], delays[i, j]) for j in range(columns)] for i in range(l)
         ]
-        A, B, C, D = _together(pairs, gains)
+        A, B, C, D = joined(pairs, gains)
         names = replace(model.names, states=())
         return StateSpace(A, B, C, D, model.dt, model.u_op, model.y_op, names, model.v_op)
 
 
-class _Pair(NamedTuple):
-    """One input and output: x+ = A x + early u_{k-q} + late u_{k-q-1}, y = C x + D u_k, q the whole part of `delay`."""
-
-    A: Array
-    early: Array
-    late: Array
-    C: Array
-    D: float
-    delay: float
-
-    def stretched(self, lag: float, dead_time: float) -> _Pair:
-        """With time constants and dead time multiplied."""
-        A, B, C = _stretched(self.A, self.early, self.C, lag)
-        delay = self.delay * dead_time
-        part = delay - np.floor(delay)
-        first, last = _held(A, B, 1 - part)
-        return _Pair(A, first, last, C, self.D, delay)
+def _off(pair: Pair, lag: float, dead_time: float) -> Pair:
+    """A pair of whole dead time, with time constants and dead time multiplied."""
+    A, B, C = _stretched(pair.A, pair.early, pair.C, lag)
+    return delayed(A, B, C, pair.D, pair.delay * dead_time)
 
 
-def _pair(model: StateSpace, i: int, j: int) -> _Pair:
+def _pair(model: StateSpace, i: int, j: int) -> Pair:
     """Output i and input j of a model, by as few states as it takes."""
     n = model.n_states
     pulses, column = [], model.B[:, j]
@@ -112,7 +96,7 @@ def _pair(model: StateSpace, i: int, j: int) -> _Pair:
     root = np.sqrt(size[:order])
     A = (left[:, :order] / root).T @ shifted @ (right[:order].T / root)
     B, C = root * right[:order, 0], left[0, :order] * root
-    return _Pair(A, B, np.zeros(order), C, float(model.D[i, j]), float(dead))
+    return Pair(A, B, np.zeros(order), C, float(model.D[i, j]), float(dead))
 
 
 def _stretched(A: Array, B: Array, C: Array, lag: float) -> tuple[Array, Array, Array]:
@@ -138,46 +122,3 @@ def _stretched(A: Array, B: Array, C: Array, lag: float) -> tuple[Array, Array, 
         slowed = np.real(expm(np.real(logm(held)) / lag))
         T[:count, :count], B[:count] = slowed[:count, :count], slowed[:count, count]
     return T, B, C
-
-
-def _held(A: Array, B: Array, part: float) -> tuple[Array, Array]:
-    """How an input acts that comes when only the last `part` of a sample is left: then, and in the sample after."""
-    if part == 1.0 or not len(A):
-        return B, np.zeros_like(B)
-    early = part * B
-    if np.abs(np.linalg.eigvals(A)).min() > SLOWEST_FREE:
-        from scipy.linalg import expm, logm
-
-        held = np.eye(len(A) + 1)
-        held[:-1, :-1], held[:-1, -1] = A, B
-        flow = logm(held)
-        if np.isrealobj(flow) or np.abs(flow.imag).max() < NEGLIGIBLE:
-            early = expm(np.real(flow) * part)[:-1, -1]
-    return early, B - early
-
-
-def _together(pairs: list[list[_Pair]], gains: Array) -> tuple[Array, Array, Array, Array]:
-    """One model of all pairs, whose inputs pass through common chains of past values."""
-    l, m = gains.shape
-    chains = [max(int(np.floor(pairs[i][j].delay)) + 1 for i in range(l)) for j in range(m)]
-    orders = [len(pairs[i][j].A) for i in range(l) for j in range(m)]
-    first_pair = sum(chains)
-    n = first_pair + sum(orders)
-    A, B, C, D = np.zeros((n, n)), np.zeros((n, m)), np.zeros((l, n)), np.zeros((l, m))
-    starts = np.cumsum([0, *chains[:-1]])
-    for j, (start, length) in enumerate(zip(starts, chains, strict=True)):
-        B[start, j] = 1.0
-        A[start + 1 : start + length, start : start + length - 1] = np.eye(length - 1)
-    at = first_pair
-    for i in range(l):
-        for j in range(m):
-            pair, gain = pairs[i][j], gains[i, j]
-            own = slice(at, at := at + len(pair.A))
-            whole = int(np.floor(pair.delay))
-            A[own, own], C[i, own], D[i, j] = pair.A, gain * pair.C, gain * pair.D
-            for behind, column in ((whole, pair.early), (whole + 1, pair.late)):
-                if behind == 0:
-                    B[own, j] += column
-                else:
-                    A[own, starts[j] + behind - 1] += column
-    return A, B, C, D
