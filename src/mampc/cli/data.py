@@ -121,11 +121,17 @@ def identify(
     order: Annotated[int | None, typer.Option(help="Model order; default from the singular values.")] = None,
     weighting: Annotated[str, typer.Option(help="cva, n4sid or moesp.")] = "cva",
     block_rows: Annotated[
-        int | None, typer.Option(help="Samples of past and future; more than the longest delay.")
+        int | None, typer.Option(help="Samples of past and future; default from the record.")
     ] = None,
     feedthrough: Annotated[
         bool, typer.Option(help="Estimate D: inputs that show in the outputs within their own sample.")
     ] = False,
+    detrend: Annotated[
+        str,
+        typer.Option(
+            help="none, constant, linear or differences; auto takes what predicts held-out data best."
+        ),
+    ] = "auto",
     share: Annotated[float, typer.Option(help="Part of the record to estimate on; the rest validates.")] = 2
     / 3,
     out: Annotated[
@@ -153,6 +159,7 @@ def identify(
     )  # fmt: skip
     settings = {
         "order": order, "weighting": weighting, "block_rows": block_rows, "feedthrough": feedthrough,
+        "detrend": detrend,
     }  # fmt: skip
     with progress() as show:
         outcome = identify_and_write(
@@ -170,12 +177,8 @@ def identify(
         lengths = ", ".join(map(str, outcome.records[:8])) + (", ..." if len(outcome.records) > 8 else "")
         console.print(f"Estimated on {len(outcome.records)} pieces of {lengths} samples", soft_wrap=True)
     console.print(fit_table(outcome))
-    values = " ".join(f"{value:.3g}" for value in identified.singular_values[:8])
-    console.print(f"Order {identified.order}; first singular values {values}", soft_wrap=True)
-    if identified.integrators:
-        console.print(
-            f"{identified.integrators} of its poles integrate: they are exactly one", soft_wrap=True
-        )
+    console.print(f"Order {identified.order}", soft_wrap=True)
+    print_list(console, "Found and decided", identified.notes)
     for warning in outcome.warnings:
         complain(f"warning: {warning}")
     console.print(f"Wrote {target}", soft_wrap=True, markup=False)

@@ -4,31 +4,33 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.base.checks import Array, as_whole
+from mampc.base.checks import Array, as_array, as_matrix, as_whole
 from mampc.base.errors import MampcError
+from mampc.identification.arx import estimate_arx
 from mampc.identification.data import IOData
-from mampc.identification.integrators import explains_as_well, near_one, with_integrators
-from mampc.identification.realisation import inside_unit_circle, realise
+from mampc.identification.delays import Integers, find_delays
+from mampc.identification.estimate import DEGREES, Settings, estimate
+from mampc.identification.held_out import AS_GOOD, CLEARLY, RIVAL, WALK, compared, errors, split
+from mampc.identification.parts import Part, assembled, groups
 from mampc.identification.scaling import Scaled, scaled
-from mampc.identification.simulation_error import InputFit, fit_inputs, independent_samples, residuals
-from mampc.identification.subspace import (
-    WEIGHTINGS,
-    correlations,
-    hankel_factor,
-    observability,
-    require_excitation,
-    supported_order,
-)
+from mampc.identification.subspace import WEIGHTINGS
 from mampc.identification.validation import Validation, validate
 from mampc.systems.state_space import StateSpace
 
-NEAR_BEST = 1.02  # simulation errors that are as good as equal
-SIGNIFICANT = 4.0  # a square of two standard deviations
+DETREND = ("auto", *DEGREES)
+TRENDS = {
+    "none": "nothing was taken off the record",
+    "constant": "constants were fitted",
+    "linear": "a line in time was fitted to each output",
+    "differences": "changes were explained, as outputs that drift ask for",
+}
+ENOUGH = 20_000  # samples in which choices are compared
+SHORT = 3  # samples of dead time that are left to the states
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +41,15 @@ class Identified:
         model: discrete `StateSpace`; its operating point is where the model rests at the mean inputs.
         x0: state at the first sample of the first record, shape (n,).
         singular_values: of the weighted projection, shape (s * l,); canonical correlations for "cva",
-            else in the outputs' units.
-        order: n.
+            else in the outputs' units; of all parts where outputs have dead times of their own, none of a rival's.
+        order: n, dead times not counted.
         integrators: how many poles are exactly one.
-        fit: percent per output, shape (l,), of the simulated model on the (first) record itself.
+        delays: dead times in samples, shape (l, m + d), beyond the one of every sampled plant; they are
+            shift registers among the model's states.
+        detrend: what was done about drifts, one of "none", "constant", "linear", "differences".
+        notes: what was found and decided, in sentences.
+        fit: percent per output, shape (l,), of the simulated model on the (first) record itself, a line in
+            time set aside if `detrend` is "linear" or "differences".
         stabilised: True if poles were moved inside the unit circle.
     """
 
@@ -51,12 +58,15 @@ class Identified:
     singular_values: Array
     order: int
     integrators: int
+    delays: Integers
+    detrend: str
+    notes: tuple[str, ...]
     fit: Array
     stabilised: bool
 
     def validate(self, data: IOData) -> Validation:
-        """Simulate the model on another record; see `mampc.validate`."""
-        return validate(self.model, data)
+        """Simulate the model on another record, drifts set aside as they were here; see `mampc.validate`."""
+        return validate(self.model, data, drift=self.detrend in ("linear", "differences"))
 
 
 def n4sid(
@@ -67,6 +77,8 @@ def n4sid(
     block_rows: int | None = None,
     feedthrough: bool = True,
     unstable: str = "stabilise",
+    detrend: str = "auto",
+    delays: Any = None,
 ) -> Identified:
     """Identify a state-space model from one record or several of the same plant.
 
@@ -83,6 +95,11 @@ def n4sid(
             for a high order.
         feedthrough: False fixes D = 0, as for sampled physical plants.
         unstable: "stabilise" mirrors poles outside the unit circle to its inside, "refuse" raises.
+        detrend: "none" explains the signals as they are, "constant" (beside the means) and "linear" fit a
+            constant or a line in time to each output of each record, "differences" explains changes from
+            sample to sample; "auto" takes what predicts held-out data best, the simplest if that is alike.
+        delays: dead times in samples, beyond the one of every sampled plant, a scalar or (l, m + d); by
+            default those that show in the record, if they exceed `SHORT` and predict held-out data.
 
     Raises:
         MampcError: a record too short, constant signals, or an unstable model with unstable="refuse".
@@ -91,115 +108,153 @@ def n4sid(
         raise MampcError(f"weighting: expected one of {WEIGHTINGS}, received {weighting!r}")
     if unstable not in ("stabilise", "refuse"):
         raise MampcError(f"unstable: expected 'stabilise' or 'refuse', received {unstable!r}")
+    if detrend not in DETREND:
+        raise MampcError(f"detrend: expected one of {DETREND}, received {detrend!r}")
     given = _records(data)
     first = given[0]
     m, l = first.u.shape[1], first.y.shape[1]
-    s = _block_rows([len(record) for record in given], m, l, order, block_rows)
-    records = scaled(given)
-    degree = 0
-    # A record that starts or ends in a transient has means that are not a rest of the system: the constant
-    # left would pass for one more mode. "n4sid" and "moesp" keep it, as SLICOT does.
-    R = hankel_factor(records.u, records.y, s, degree if weighting == "cva" else -1)
-    require_excitation(R, m, s)
-    gamma, singular_values = observability(R, m, l, s, weighting, records.y_spread)
-    if order is None:
-        most = supported_order(
-            correlations(R, m, l, s), records.samples - 2 * s * len(given) - s * m, m, l, s
-        )
-        orders = range(1, most + 1)
-    elif order <= len(singular_values) - l:
-        orders = range(order, order + 1)
-    else:
-        most = len(singular_values) - l
-        raise MampcError(f"order: expected at most {most} with {s} block rows, received {order}")
-    chosen = _best_order(gamma, orders, records, feedthrough, unstable)
-    chosen = _with_integrators(chosen, gamma[:, : len(chosen.A)], records, feedthrough, unstable)
-    chosen = _without_idle_constant(chosen, records, feedthrough)
-    model = _model(chosen, records, first)
-    quality = validate(model, first)
+    lengths = [len(record) for record in given]
+    s = _block_rows(lengths, m, l, order, block_rows)
+    records = scaled(given, centred=detrend != "none")
+    settings = Settings(order, weighting, s, feedthrough, unstable)
+    dead = _given_delays(delays, l, m, min(lengths))
+    choice = _chosen(records, settings, detrend, dead)
+    values: list[Array] = []
+    parts = _parts(records, settings, choice, values)
+    model = assembled(parts, records, first)
+    integrators = sum(part.integrators for part in parts)
+    notes = list(choice.notes)
+    if integrators:
+        notes.append(f"Poles that the record cannot tell from one were made exactly one: {integrators}.")
+    quality = validate(model, first, drift=choice.trend in ("linear", "differences"))
     return Identified(
-        model, quality.x0, singular_values, model.n_states, chosen.integrators, quality.fit, chosen.stabilised
+        model=model,
+        x0=quality.x0,
+        singular_values=np.sort(np.concatenate(values))[::-1] if values else np.empty(0),
+        order=sum(len(part.A) for part in parts),
+        integrators=integrators,
+        delays=choice.delays,
+        detrend=choice.trend,
+        notes=tuple(notes),
+        fit=quality.fit,
+        stabilised=any(part.stabilised for part in parts),
     )
 
 
-class _Candidate(NamedTuple):
-    A: Array
-    C: Array
+@dataclass(frozen=True)
+class _Choice:
+    """What is estimated: the trend, the dead times (l, m), and whether the rival's poles are taken."""
+
+    trend: str
+    delays: Integers
+    rival: bool = False
+    notes: tuple[str, ...] = ()
+
+
+class _Score(NamedTuple):
+    """Of a choice on held-out data: see `held_out.errors`; and how many integrators and states it takes."""
+
+    error: float
+    walk: float
+    level: float
     integrators: int
-    stabilised: bool
-    fit: InputFit
+    states: int
 
 
-def _best_order(
-    gamma: Array, orders: Sequence[int], records: Scaled, feedthrough: bool, unstable: str
-) -> _Candidate:
-    """The smallest order whose simulation error is nearly the least."""
-    candidates = []
-    for n in orders:
-        A, C = realise(gamma[:, :n], records.y[0].shape[1])
-        A, stabilised = inside_unit_circle(A, unstable)
-        candidates.append(_Candidate(A, C, 0, stabilised, fit_inputs(A, C, records, feedthrough=feedthrough)))
-    best = min(candidate.fit.error for candidate in candidates)
-    return next(candidate for candidate in candidates if candidate.fit.error <= NEAR_BEST * best)
+def _parts(
+    records: Scaled, settings: Settings, choice: _Choice, values: list[Array] | None = None
+) -> list[Part]:
+    """The parts of a model; appends the singular values of each."""
+    if choice.rival:
+        return estimate_arx(records, choice.delays, settings, choice.trend)
+    parts = []
+    for outputs, delays in groups(choice.delays):
+        part, own = estimate(records, outputs, delays, settings, choice.trend)
+        parts.append(part)
+        if values is not None:
+            values.append(own)
+    return parts
 
 
-def _with_integrators(
-    found: _Candidate, gamma: Array, records: Scaled, feedthrough: bool, unstable: str
-) -> _Candidate:
-    """As many slow poles moved to one as the records do not contradict; see `integrators`."""
-    A, C = realise(gamma, records.y[0].shape[1])
-    counts = near_one(A, max(map(len, records.u)))
-    if not counts:
-        return found
-    free = found
-    if found.stabilised:  # what grows slowly is compared as it was found
-        free = found._replace(fit=fit_inputs(A, C, records, feedthrough=feedthrough))
-    for q in counts:
-        A1, C1 = with_integrators(A, C, q)
-        A1, stabilised = inside_unit_circle(A1, unstable, q)
-        fit = fit_inputs(A1, C1, records, feedthrough=feedthrough, integrators=q)
-        if explains_as_well(fit.error, free.fit.error, independent_samples(residuals(A1, C1, fit, records))):
-            return _Candidate(A1, C1, q, stabilised, fit)
-    return found
+def _chosen(records: Scaled, settings: Settings, detrend: str, delays: Integers | None) -> _Choice:
+    """Trend, dead times and rival by what predicts the held-out part of the records."""
+    m, l = records.u[0].shape[1], records.y[0].shape[1]
+    none = np.zeros((l, m), dtype=int)
+    found = find_delays(records.u, records.y) if delays is None else delays
+    if delays is None and found.max() <= SHORT:
+        found = none
+    front, back = split(records.shortened(ENOUGH))
+    notes: list[str] = []
+
+    def scored(choice: _Choice) -> _Score:
+        try:
+            s = _block_rows([len(u) - int(choice.delays.max()) for u in front.u], m, l, settings.order, None)
+            trial = replace(settings, block_rows=min(s, settings.block_rows))
+            parts = _parts(front, trial, choice)
+        except MampcError:
+            return _Score(np.inf, 0.0, np.inf, 0, 0)
+        return _Score(
+            *errors(parts, back), sum(part.integrators for part in parts), sum(len(part.A) for part in parts)
+        )
+
+    trends = ("constant", "linear", "differences") if detrend == "auto" else (detrend,)
+    choices = [_Choice(trend, found) for trend in trends]
+    scores = [scored(choice) for choice in choices]
+    if not any(np.isfinite(score.error) for score in scores):
+        why = "Too short to hold a part out, so that nothing was compared"
+        return _Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
+    # A drift passes for an integrator or a slow mode that inputs hardly move: the fewest of these win, and among
+    # equals changes are explained where what is left of levels walks, else the simplest.
+    first = scores[0]
+    fair = [
+        k
+        for k, score in enumerate(scores)
+        if k == 0
+        or (score.level <= first.level + CLEARLY and score.states <= first.states)
+        or score.error < first.error - CLEARLY
+    ]
+    least = min(scores[k].error for k in fair)
+    near = [k for k in fair if scores[k].error <= least + AS_GOOD]
+    walks = scores[near[0]].walk > WALK
+
+    def rank(k: int) -> tuple[int, int, bool, int]:
+        return scores[k].integrators, scores[k].states, walks and trends[k] != "differences", k
+
+    best = min(near, key=rank)
+    choice, score = choices[best], scores[best].error
+    said = f"Trend: {TRENDS[choice.trend]}"
+    if best:
+        said += f"; this predicts held-out data {compared(score, scores[0].error)} constants"
+    notes.append(f"{said}.")
+    if delays is None and found.any():
+        without = scored(replace(choice, delays=none)).error
+        if without < score - AS_GOOD:
+            choice, score = replace(choice, delays=none), without
+        else:
+            spans = ", ".join(map(str, np.unique(found[found > 0])))
+            notes.append(
+                f"Dead times of {spans} samples; they predict held-out data {compared(score, without)} none."
+            )
+    if settings.order is None:
+        rival = scored(replace(choice, rival=True)).error
+        wins = rival < score - RIVAL
+        choice = replace(choice, rival=wins)
+        poles, other = ("ARX", "subspace") if wins else ("Subspace", "ARX")
+        said = compared(min(rival, score) if wins else score, score if wins else rival)
+        notes.append(f"{poles} poles; they predict held-out data {said} {other} ones.")
+    return replace(choice, notes=tuple(notes))
 
 
-def _without_idle_constant(found: _Candidate, records: Scaled, feedthrough: bool) -> _Candidate:
-    """Constants beside the means only where they say something: elsewhere they compete with slow modes."""
-    if found.integrators:
-        return found
-    A, C = found.A, found.C
-    fit = fit_inputs(A, C, records, feedthrough=feedthrough, degree=-1)
-    left = independent_samples(residuals(A, C, found.fit, records))
-    constants = len(records.u) * len(C)
-    if left * (fit.error**2 - found.fit.error**2) <= SIGNIFICANT * constants * found.fit.error**2:
-        return found._replace(fit=fit)
-    return found
-
-
-def _model(chosen: _Candidate, records: Scaled, like: IOData) -> StateSpace:
-    """In engineering units, about the rest that the records' constants tell.
-
-    Where integrators drift under the mean inputs, the inputs of the operating point are the nearest ones, in
-    units of their spread, under which they rest.
-    """
-    A, C, q, (B, D, trends, _) = chosen.A, chosen.C, chosen.integrators, chosen.fit
-    m = len(like.names.inputs)
-    share = np.array([len(u) for u in records.u]) / records.samples
-    drive = sum(w * trend.drive for w, trend in zip(share, trends, strict=True))
-    du = np.linalg.lstsq(B[:q, :m], -drive)[0] if q else np.zeros(m)
-    rest = np.linalg.solve(np.eye(len(A) - q) - A[q:, q:], B[q:, :m] @ du)
-    constant = sum(
-        w * (mean + records.y_spread * trend.polynomial[:1].sum(axis=0))
-        for w, mean, trend in zip(share, records.y_mean, trends, strict=True)
-    )
-    y_op = constant + records.y_spread * (C[:, q:] @ rest + D[:, :m] @ du)
-    u_op = records.u_mean.copy()
-    u_op[:m] += du * records.u_spread[:m]
-    rows = records.y_spread[:, None]
-    return StateSpace(
-        A, B / records.u_spread, rows * C, rows * D / records.u_spread, like.dt, u_op[:m], y_op,
-        like.names, v_op=u_op[m:],
-    )  # fmt: skip
+def _given_delays(delays: Any, l: int, m: int, shortest: int) -> Integers | None:
+    if delays is None:
+        return None
+    given = as_array("delays", delays)
+    given = np.full((l, m), float(given)) if given.ndim == 0 else as_matrix("delays", given, l, m)
+    if not (given == np.round(given)).all() or given.min() < 0 or given.max() >= shortest // 4:
+        raise MampcError(
+            f"delays: expected whole numbers of samples from 0 to {shortest // 4}, received {given.tolist()}"
+        )
+    return given.astype(int)
 
 
 def _records(data: IOData | Sequence[IOData]) -> list[IOData]:

@@ -35,6 +35,17 @@ class Scaled:
         """Of all records together."""
         return sum(map(len, self.u))
 
+    def shortened(self, samples: int) -> Scaled:
+        """No more than about so many samples: the same share of every record, from its beginning."""
+        share = samples / self.samples
+        if share >= 1:
+            return self
+        cuts = [max(1, round(share * len(u))) for u in self.u]
+        return self.replaced(
+            [u[:cut] for u, cut in zip(self.u, cuts, strict=True)],
+            [y[:cut] for y, cut in zip(self.y, cuts, strict=True)],
+        )
+
     def replaced(self, u: Sequence[Array], y: Sequence[Array]) -> Scaled:
         """The same units and means for other samples."""
         return Scaled(tuple(u), tuple(y), self.u_mean, self.y_mean, self.u_spread, self.y_spread)
@@ -48,14 +59,15 @@ def scaled(records: Sequence[IOData], *, centred: bool = True) -> Scaled:
     """
     first = records[0]
     names = (*first.names.inputs, *first.names.disturbances, *first.names.outputs)
-    ranges = [np.ptp(np.hstack([record.u, record.y]), axis=0) for record in records]
+    ranges = [np.concatenate([np.ptp(record.u, axis=0), np.ptp(record.y, axis=0)]) for record in records]
     still = [name for name, moved in zip(names, np.max(ranges, axis=0), strict=True) if moved == 0]
     if still:
         raise MampcError(f"n4sid: expected signals that vary, received constant {', '.join(still)}")
     u_spread = _spread([record.u for record in records])
     y_spread = _spread([record.y for record in records])
     m, l = len(u_spread), len(y_spread)
-    u_mean = np.concatenate([record.u for record in records]).mean(axis=0) if centred else np.zeros(m)
+    count = sum(map(len, records))
+    u_mean = sum(record.u.sum(axis=0) for record in records) / count if centred else np.zeros(m)
     y_mean = tuple(record.y.mean(axis=0) if centred else np.zeros(l) for record in records)
     return Scaled(
         tuple((record.u - u_mean) / u_spread for record in records),
@@ -68,6 +80,6 @@ def _spread(signals: Sequence[Array]) -> Array:
     """Standard deviation of each column about the means of its pieces; of the whole where they stand still."""
     count = sum(map(len, signals))
     about_own = np.sqrt(sum(len(piece) * piece.var(axis=0) for piece in signals) / count)
-    whole = np.concatenate(signals).std(axis=0)
+    whole = np.concatenate(signals).std(axis=0) if len(signals) > 1 else about_own
     spread: Array = np.where(about_own > 1e-9 * whole, about_own, whole)
     return spread

@@ -78,6 +78,18 @@ def fit_inputs(
     return InputFit(B, D, trends, error)
 
 
+def fit_trends(
+    A: Array, C: Array, B: Array, D: Array, records: Scaled, *, degree: int, integrators: int
+) -> list[Trend]:
+    """Only the trends, B and D being known; see `fit_inputs`."""
+    unexplained = [
+        y - states(A, u @ B.T, np.zeros(len(A))) @ C.T - u @ D.T
+        for u, y in zip(records.u, records.y, strict=True)
+    ]
+    without = records.replaced([u[:, :0] for u in records.u], unexplained)
+    return fit_inputs(A, C, without, feedthrough=False, degree=degree, integrators=integrators).trends
+
+
 def _rows(
     A: Array, C: Array, u: Array, y: Array, feedthrough: bool, degree: int, directions: Array, drives: int
 ) -> Iterator[Array]:

@@ -34,10 +34,11 @@ class Validation:
     whiteness: Array
 
 
-def validate(model: StateSpace, data: IOData) -> Validation:
+def validate(model: StateSpace, data: IOData, *, drift: bool = False) -> Validation:
     """Simulate the model over a record, without feedback of its outputs.
 
-    The outputs serve only to fit the initial state by least squares.
+    The outputs serve only to fit the initial state by least squares, and with `drift` a line in time at each
+    output, which y_hat then contains and about which the fit is measured.
 
     Raises:
         MampcError: another sample time or number of signals than the model's.
@@ -49,10 +50,12 @@ def validate(model: StateSpace, data: IOData) -> Validation:
             f"validate: expected {model.B.shape[1]} inputs and {model.n_outputs} outputs, "
             f"received {data.u.shape[1]} and {data.y.shape[1]}"
         )
-    x0 = initial_state(model, data)
-    y_hat = model.response(data.u, x0)
+    x0, line = initial_state(model, data, drift=drift)
+    y_hat = model.response(data.u, x0) + line
     residuals = data.y - y_hat
-    return Validation(fit(data.y, y_hat), y_hat, residuals, x0, whiteness(residuals))
+    own = _lines(len(data)) if drift else np.empty((len(data), 0))
+    level = own @ (own.T @ data.y)
+    return Validation(fit(data.y - level, y_hat - level), y_hat, residuals, x0, whiteness(residuals))
 
 
 def fit(y: Array, y_hat: Array) -> Array:
@@ -64,25 +67,37 @@ def fit(y: Array, y_hat: Array) -> Array:
     return percent
 
 
-def initial_state(model: StateSpace, data: IOData) -> Array:
-    """The state at the first sample that fits the outputs best, shape (n,).
+def initial_state(model: StateSpace, data: IOData, *, drift: bool = False) -> tuple[Array, Array]:
+    """The state at the first sample that fits the outputs best, shape (n,), and lines in time, shape (N, l).
 
-    Least squares over all samples, each output in units of its standard deviation.
+    Least squares over all samples, each output in units of its standard deviation. Lines are zero without
+    `drift`.
     """
+    n, l, N = model.n_states, model.n_outputs, len(data)
     unexplained = data.y - model.response(data.u)
     spread = data.y.std(axis=0)
     spread[spread == 0.0] = 1.0
-    impulse = np.zeros((len(data), 1))
+    impulse = np.zeros((N, 1))
     impulse[0] = 1.0
-    factor: Array = np.empty((0, model.n_states + 1))
+    lines = _lines(N) if drift else np.empty((N, 0))
+    own = lines.shape[1] * l
+    factor: Array = np.empty((0, n + own + 1))
     start = 0
     for free in filtered(model.A, model.C / spread[:, None], impulse):
-        rows = np.concatenate(
-            [free[..., 0], (unexplained[start : start + len(free)] / spread)[..., None]], axis=2
-        )
-        factor = fold(factor, rows.reshape(-1, model.n_states + 1))
+        chunk = slice(start, start + len(free))
+        at_outputs = np.einsum("kd,op->kodp", lines[chunk], np.eye(l)).reshape(len(free), l, own)
+        right = (unexplained[chunk] / spread)[..., None]
+        rows = np.concatenate([free[..., 0], at_outputs, right], axis=2)
+        factor = fold(factor, rows.reshape(-1, n + own + 1))
         start += len(free)
-    return solve(factor)
+    solution = solve(factor)
+    return solution[:n], lines @ solution[n:].reshape(-1, l) * spread
+
+
+def _lines(samples: int) -> Array:
+    """An orthonormal basis of lines in time, shape (samples, 2)."""
+    time = np.arange(samples) / samples - 0.5
+    return np.linalg.qr(np.column_stack([np.ones(samples), time]))[0]
 
 
 def whiteness(residuals: Array, lags: int = 20) -> Array:

@@ -79,7 +79,7 @@ def identify_and_write(
     if poor:
         warnings.append(
             f"the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at the "
-            "figure, and try another --order, more --block-rows for long delays, or a richer record"
+            "figure, and try another --order or --detrend, or a richer record"
         )
     try:
         save_figure(validation_figure(rest, validation), target.with_suffix(""))

@@ -1,0 +1,168 @@
+"""One part of a model from records: order, integrators, inputs and constants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError
+from mampc.identification.delays import Integers
+from mampc.identification.drift import high_passed, theta, white_and_walk
+from mampc.identification.integrators import explains_as_well, near_one, with_integrators
+from mampc.identification.parts import Part, records_of_part
+from mampc.identification.realisation import inside_unit_circle, realise
+from mampc.identification.scaling import Scaled
+from mampc.identification.simulation_error import (
+    InputFit,
+    fit_inputs,
+    fit_trends,
+    independent_samples,
+    residuals,
+)
+from mampc.identification.subspace import (
+    correlations,
+    hankel_factor,
+    observability,
+    require_excitation,
+    supported_order,
+)
+
+NEAR_BEST = 1.02  # simulation errors that are as good as equal
+LITTLE = 0.2  # a filter's pole that makes no difference
+EQUATIONS, LEAST = 15_000, 1000  # in which orders are compared, and samples
+SIGNIFICANT = 4.0  # a square of two standard deviations
+DEGREES = {"none": -1, "constant": 0, "linear": 1, "differences": -1}  # of the trend that is fitted
+PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0}  # of the trend taken off Hankel rows
+
+Dynamics = Callable[[int], tuple[Array, Array]]  # A and C of an order
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to estimate; see `n4sid`."""
+
+    order: int | None
+    weighting: str
+    block_rows: int
+    feedthrough: bool
+    unstable: str
+
+
+def estimate(
+    records: Scaled, outputs: Sequence[int], delays: Integers, settings: Settings, trend: str
+) -> tuple[Part, Array]:
+    """The part of a model that explains some outputs, and the singular values its order was read from."""
+    own = records_of_part(records, outputs, delays)
+    if trend != "differences":
+        return _estimated(own, own, tuple(outputs), delays, settings, trend)
+    part, values = _estimated(own, high_passed(own, 0.0), tuple(outputs), delays, settings, trend)
+    pole = theta(*white_and_walk(residuals(part.A, part.C, part.fit, own)))
+    if pole < LITTLE:
+        return part, values
+    return _estimated(own, high_passed(own, pole), tuple(outputs), delays, settings, trend)
+
+
+def _estimated(
+    own: Scaled, seen: Scaled, outputs: tuple[int, ...], delays: Integers, settings: Settings, trend: str
+) -> tuple[Part, Array]:
+    """The part that explains `seen`, the records of the part or these filtered."""
+    l, m, s = len(outputs), len(delays), settings.block_rows
+    # A record that starts or ends in a transient has means that are not a rest of the system: the constant
+    # left would pass for one more mode. "n4sid" and "moesp" keep it, as SLICOT does.
+    slicot = trend == "constant" and settings.weighting != "cva"
+    R = hankel_factor(seen.u, seen.y, s, -1 if slicot else PROJECTED[trend])
+    require_excitation(R, m, s)
+    gamma, values = observability(R, m, l, s, settings.weighting, own.y_spread)
+    most = len(values) - l
+    if settings.order is None:
+        columns = seen.samples - 2 * s * len(seen.u) - s * m
+        orders = range(1, supported_order(correlations(R, m, l, s), columns, m, l, s) + 1)
+    elif settings.order <= most:
+        orders = range(settings.order, settings.order + 1)
+    else:
+        raise MampcError(f"order: expected at most {most} with {s} block rows, received {settings.order}")
+    part = finished(lambda n: realise(gamma[:, :n], l), orders, own, seen, outputs, delays, settings, trend)
+    return part, values
+
+
+def finished(
+    dynamics: Dynamics, orders: Sequence[int], own: Scaled, seen: Scaled, outputs: tuple[int, ...], delays: Integers,
+    settings: Settings, trend: str,
+) -> Part:  # fmt: skip
+    """A part from A and C of several orders: the smallest order that explains the records nearly best.
+
+    Args:
+        own: the records of the part.
+        seen: what of them is explained: themselves, or what a filter leaves of them.
+    """
+    few = seen.shortened(max(LEAST, EQUATIONS // len(outputs)))
+
+    def fitted(A: Array, C: Array, q: int = 0, records: Scaled = seen) -> InputFit:
+        degree = DEGREES[trend]
+        return fit_inputs(A, C, records, feedthrough=settings.feedthrough, degree=degree, integrators=q)
+
+    tried: dict[int, Part] = {}
+
+    def attempt(n: int) -> float:
+        if n not in tried:
+            A, C = dynamics(n)
+            A, stabilised = inside_unit_circle(A, settings.unstable)
+            tried[n] = Part(outputs, delays, A, C, 0, stabilised, fitted(A, C, 0, few))
+        return tried[n].fit.error
+
+    part = tried[_smallest(attempt, orders)]
+    if few is not seen:
+        part = part._replace(fit=fitted(part.A, part.C))
+    part = _with_integrators(part, *dynamics(len(part.A)), seen, settings.unstable, fitted)
+    if trend == "differences":
+        return _on_levels(part, own)
+    return _without_idle_constant(part, seen, settings.feedthrough) if trend == "constant" else part
+
+
+def _smallest(error: Callable[[int], float], orders: Sequence[int]) -> int:
+    """The smallest order whose error is nearly the least; every order up to six is tried, every second or third
+    beyond, and those below the one that these point to.
+    """
+    coarse = [n for k, n in enumerate(orders) if k < 6 or (k < 12 and k % 2) or k % 3 == 1 or n == orders[-1]]
+    best = min(map(error, coarse))
+    found = next(n for n in coarse if error(n) <= NEAR_BEST * best)
+    below = [n for n in orders if n < found and n > max((c for c in coarse if c < found), default=0)]
+    return next((n for n in below if error(n) <= NEAR_BEST * best), found)
+
+
+def _with_integrators(
+    found: Part, A: Array, C: Array, records: Scaled, unstable: str, fitted: Callable[..., InputFit]
+) -> Part:
+    """As many slow poles moved to one as the records do not contradict; see `integrators`."""
+    counts = near_one(A, max(map(len, records.u)))
+    if not counts:
+        return found
+    free = fitted(A, C) if found.stabilised else found.fit  # what grows slowly is compared as it was found
+    for q in counts:
+        A1, C1 = with_integrators(A, C, q)
+        A1, stabilised = inside_unit_circle(A1, unstable, q)
+        fit = fitted(A1, C1, q)
+        if explains_as_well(fit.error, free.error, independent_samples(residuals(A1, C1, fit, records))):
+            return found._replace(A=A1, C=C1, integrators=q, stabilised=stabilised, fit=fit)
+    return found
+
+
+def _without_idle_constant(found: Part, records: Scaled, feedthrough: bool) -> Part:
+    """Constants beside the means only where they say something: elsewhere they compete with slow modes."""
+    if found.integrators:
+        return found
+    A, C = found.A, found.C
+    fit = fit_inputs(A, C, records, feedthrough=feedthrough, degree=-1)
+    left = independent_samples(residuals(A, C, found.fit, records))
+    constants = len(records.u) * len(C)
+    if left * (fit.error**2 - found.fit.error**2) <= SIGNIFICANT * constants * found.fit.error**2:
+        return found._replace(fit=fit)
+    return found
+
+
+def _on_levels(part: Part, records: Scaled) -> Part:
+    """A part found from differences, with the trends of the records themselves."""
+    fit = part.fit
+    trends = fit_trends(part.A, part.C, fit.B, fit.D, records, degree=0, integrators=part.integrators)
+    return part._replace(fit=fit._replace(trends=trends))
