@@ -241,6 +241,41 @@ class StateSpace:
         return y
 
     @classmethod
+    def from_first_order(
+        cls,
+        *,
+        gain: Any,
+        time_constant: Any,
+        dead_time: Any = 0.0,
+        dt: float,
+        u_op: Any = None,
+        y_op: Any = None,
+        names: Names | None = None,
+        v_op: Any = None,
+    ) -> StateSpace:
+        """The sampled model of first-order lags with dead times, one for each output and input.
+
+        Exact for inputs held between samples, dead times of parts of samples included. A dead time of q samples
+        takes q states for all channels of an input together.
+
+        Args:
+            gain: K, shape (l, m), output units per input unit (and per second where the channel integrates); columns
+                of measured disturbances behind those of the inputs.
+            time_constant: seconds, (l, m) or one for all; 0 for none, infinite for a channel that integrates.
+            dead_time: seconds, (l, m) or one for all. Channels of no gain need neither.
+            dt: sample time in seconds.
+            u_op, y_op, names, v_op: as for `StateSpace`.
+
+        Raises:
+            MampcError: shapes that do not fit together, negative or not-a-number values, dead times of more than
+                500 samples together.
+        """
+        from mampc.systems.first_order import first_order
+
+        A, B, C, D = first_order(gain, time_constant, dead_time, dt)
+        return cls(A, B, C, D, dt, u_op, y_op, names, v_op)  # type: ignore[arg-type]
+
+    @classmethod
     def from_any(cls, system: Any, dt: float | None = None) -> StateSpace:
         """Build from a python-control or scipy.signal system, or a tuple (A, B, C, D[, dt]).
 
