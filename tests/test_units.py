@@ -138,3 +138,79 @@ def test_what_a_violated_output_limit_costs_does_not_depend_on_units(u, y):
         decisions.append((decision.u / u_unit, decision.violations / y_unit, decision.objective))
     for other, usual in zip(decisions[1], decisions[0], strict=True):
         np.testing.assert_allclose(other, usual, rtol=1e-6, atol=1e-6)
+
+
+RULED = {
+    "budget": mampc.MoveRules(max_moves=3, sparsity_horizon=3),
+    "price": mampc.MoveRules(price=0.05),
+    "least size": mampc.MoveRules(price=0.05, min_size=0.2, max_moves=4),
+    "dwell": mampc.MoveRules(price=0.02, dwell=3, max_moves_per_step=1),
+}
+
+
+def decisions_in(u, y, seed, method, rules, limited=True):
+    """Samples of a closed loop on a model whose inputs and outputs are counted in units u (2,) and y (2,)."""
+    rng, usual = np.random.default_rng(seed), random_model(seed, n=3, m=2, l=2, radius=0.85)
+    model = mampc.StateSpace(
+        usual.A, usual.B / u, usual.C * y[:, None], None, 1.0, usual.u_op * u, usual.y_op * y
+    )
+    limits = mampc.Limits(
+        u_min=model.u_op - 0.8 * u, u_max=model.u_op + 0.6 * u, du_max=0.5 * u, y_max=model.y_op + 1.2 * y
+    )  # fmt: skip
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=8, control_horizon=3, limits=limits if limited else mampc.Limits(),
+        output_weight=1 / y**2, move_weight=0.1 / u**2,
+    )  # fmt: skip
+    if method == "mpc":
+        controller = mampc.MPC(problem)
+    else:
+        size = None if rules.min_size == 0.0 else rules.min_size * u
+        rules = rules if size is None else mampc.MoveRules(price=rules.price, max_moves=4, min_size=size)
+        controller = mampc.MAMPC(
+            problem, rules, method=method, on_limit_violation="ignore_budget", violation_margin=0.3 * y
+        )
+    state, x, found = controller.initial_state(), np.zeros(3), []
+    for k in range(12):
+        now = (
+            mampc.Limits(u_max=model.u_op + (0.6 - 0.05 * np.arange(3)[:, None]) * u)
+            if limited and k % 3
+            else None
+        )
+        reference = model.y_op + (1.5 if k < 6 else -0.5) * y
+        decision = controller.step(
+            state, x + 0.05 * rng.standard_normal(3), reference, limits=now, manual=[k in (3, 9), False]
+        )
+        found.append(decision)
+        state, x = decision.state, model.A @ x + model.B @ (decision.u - model.u_op)
+    return found
+
+
+@pytest.mark.parametrize("rules", RULED)
+@pytest.mark.parametrize("method", ["mpc", "exact", "greedy", "hard_thresholding", "l1", "reweighted_l1"])
+def test_moves_and_words_are_the_same_whatever_the_units(method, rules):
+    """But for the alternating method, whose one penalty for all inputs is in their units, and two that multiply
+    rounding from round to round, in the same units as well: penalty decomposition and ADMM.
+    """
+    rng = np.random.default_rng(0)
+    for seed in range(4):
+        for limited in (True, False):
+            usual = decisions_in(np.ones(2), np.ones(2), seed, method, RULED[rules], limited)
+            for _ in range(2):
+                u, y = 1e3 ** rng.integers(-2, 3, 2).astype(float), 10.0 ** rng.uniform(-6, 6, 2)
+                other = decisions_in(u, y, seed, method, RULED[rules], limited)
+                for a, b in zip(usual, other, strict=True):
+                    np.testing.assert_array_equal(b.moves, a.moves)
+                    assert (b.status, b.remarks) == (a.status, a.remarks)
+                    np.testing.assert_allclose(b.changes / u, a.changes, atol=1e-6)
+                    assert b.objective == pytest.approx(a.objective, rel=1e-6, abs=1e-9, nan_ok=True)
+
+
+@pytest.mark.parametrize("rules", RULED)
+def test_the_proven_optimum_has_the_same_moves_in_units_that_have_no_prefix(rules):
+    rng = np.random.default_rng(1)
+    for seed in range(4):
+        usual = decisions_in(np.ones(2), np.ones(2), seed, "exact", RULED[rules])
+        u, y = 10.0 ** rng.uniform(-6, 6, 2), 10.0 ** rng.uniform(-6, 6, 2)
+        for a, b in zip(usual, decisions_in(u, y, seed, "exact", RULED[rules]), strict=True):
+            np.testing.assert_array_equal(b.moves, a.moves)
+            assert (b.status, b.remarks) == (a.status, a.remarks)

@@ -61,6 +61,7 @@ class Controller(ABC):
         self._usual_limits = UsualLimits(self.condensed)
         self._some_unlimited = bool(np.isinf([limits.u_min, limits.u_max]).any())
         self._du_max = limits.du_max if np.isfinite(limits.du_max).any() else None
+        self._resolution = SAME * self.condensed.input_prefix
         self._no_violations = np.zeros(model.n_outputs)
         self._unknown_violations = np.full(model.n_outputs, np.nan)
         self._shape = (problem.control_horizon, model.n_inputs)
@@ -222,7 +223,7 @@ class Controller(ABC):
             planned = np.concatenate((state.inputs[-1:], changes)).cumsum(axis=0)[1:]
         planned = planned.reshape(self._shape)
         kept = inputs.clipped(planned)
-        if (np.abs(kept - planned) > SAME + ROUNDED * np.abs(planned)).any():
+        if (np.abs(kept - planned) > self._resolution + ROUNDED * np.abs(planned)).any():
             # Planned beyond what counts as a number: this is another plan, of which nothing is proven.
             changes = np.diff(kept, axis=0, prepend=state.inputs[-1:])
             status, lower_bound, objective = Status.FEASIBLE, -np.inf, None
@@ -239,7 +240,7 @@ class Controller(ABC):
         """The plan to hold the inputs, or the nearest ones within their limits."""
         planned = inputs.held(state.inputs[-1], self._shape[0])
         moves, remarks = np.diff(planned, axis=0, prepend=state.inputs[-1:]).ravel(), plan.remarks
-        if (np.abs(moves) > SAME).any():
+        if (np.abs(moves.reshape(self._shape)) > self._resolution).any():
             remarks = (*remarks, Remark.BACK_INSIDE)
         return plan._replace(
             moves=moves, lower_bound=-np.inf, inputs=planned, objective=np.nan,
@@ -261,11 +262,12 @@ class Controller(ABC):
         # What is handed out is also what is remembered.
         u, history = inputs.applied(planned), state.inputs
         history = u[None] if len(history) == 1 else np.concatenate((history[1:], u[None]))
-        for array in (planned, changes, violations, u, history):
+        for array in (planned, changes, violations, u, history, self._resolution):
             array.setflags(write=False)
         return Decision(
             u, planned, changes, plan.status, objective, lower_bound, plan.iterations, perf_counter() - start,
             ControllerState(history, state.samples + 1, plan.guess, plan.active, plan.memory), plan.remarks, violations,
+            self._resolution,
         )  # fmt: skip
 
     def _unrestricted(self, sample: Sample, state: ControllerState) -> Plan:

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
-from mampc.base.tolerances import SAME
 from mampc.base.words import Fault, Remark, Status
 
 
@@ -51,6 +50,8 @@ class Decision(NamedTuple):
         remarks: anything else worth knowing.
         violations: predicted excess of each output over its limits, the largest over i = 1..np, in output
             units, shape (l,); zeros without output limits, not-a-number where nothing could be predicted.
+        resolution: changes up to here are rounding and no moves, in input units, shape (m,): 1e-9 for inputs of
+            ordinary numbers.
         ignored_outputs: outputs whose measurement was not believed at this sample, by name, and why; filled by
             `Regulator`.
     """
@@ -66,6 +67,7 @@ class Decision(NamedTuple):
     state: Any
     remarks: tuple[Remark, ...]
     violations: Array
+    resolution: Array
     ignored_outputs: Mapping[str, Fault] = {}
 
     @property
@@ -77,7 +79,7 @@ class Decision(NamedTuple):
     @property
     def moves(self) -> BoolArray:
         """Which planned changes are moves (larger than rounding), shape (nc, m)."""
-        moves: BoolArray = np.abs(self.changes) > SAME
+        moves: BoolArray = np.abs(self.changes) > self.resolution
         return moves
 
     @property

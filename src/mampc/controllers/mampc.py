@@ -69,7 +69,9 @@ class MAMPC(Controller):
         self._margin = margin if on_limit_violation == "ignore_budget" else None
         self.rules, self._memory = rules, rules.memory
         self.method = method_of(method, settings)
-        self._admissible = AdmissiblePatterns(rules, problem.model.n_inputs, problem.control_horizon)
+        self._admissible = AdmissiblePatterns(
+            rules, problem.model.n_inputs, problem.control_horizon, self.condensed.input_prefix
+        )
         self._check_sizes()
         # Without any rule this is plain MPC.
         self._search = None if self._admissible.unrestricted else self.method.prepare(self.condensed, rules)
@@ -85,7 +87,7 @@ class MAMPC(Controller):
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
     def _charge(self, moves: Array) -> float:
-        return self._admissible.charge(np.abs(moves) > SAME)
+        return self._admissible.charge(np.abs(moves) > SAME * self.condensed.move_prefix)
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
         search = self._search
@@ -103,7 +105,7 @@ class MAMPC(Controller):
         """The plan without moves that are too small to count."""
         if plan.moves is None:
             return plan
-        size = np.abs(plan.moves)
+        size = np.abs(plan.moves) / self.condensed.move_prefix
         if np.count_nonzero(size > ROUNDING) == np.count_nonzero(size):
             return plan
         moves = without_rounding(self.condensed, sample, plan.moves)
@@ -120,7 +122,8 @@ class MAMPC(Controller):
         urgent = self._unrestricted(sample, state)
         if urgent.moves is None:
             return plan
-        lower = self.condensed.violations(sample, urgent.moves) < violations - URGENT
+        gained = violations - self.condensed.violations(sample, urgent.moves)
+        lower = gained * self.condensed.bounds.violation_scale > URGENT
         if not (lower & (violations > margin)).any():
             return plan
         return urgent._replace(

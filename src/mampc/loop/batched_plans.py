@@ -113,7 +113,9 @@ class BatchedExact(BatchedPlans):
         for group in np.split(order, ends[:-1] + 1):
             inside, moves, u = self._map(int(best[group[0]])).at(parameters[group])
             small = np.abs(moves)
-            decided[group] &= inside & ~((small > 0) & (small <= ROUNDING)).any(axis=1)
+            decided[group] &= inside & ~((small > 0) & (small <= ROUNDING * self._condensed.move_prefix)).any(
+                axis=1
+            )
             decided[group] &= ((u >= self._low) & (u <= self._high)).all(axis=1)
             first[group] = u
         return decided, first
@@ -143,7 +145,10 @@ class BatchedExact(BatchedPlans):
         """The price of each pattern, infinite where the inputs so far (S, h, m) forbid it; (S, K) or (1, K)."""
         if inputs.shape[1] == 1:
             return self._cost(self._admissible.allowance(inputs[0]))[None]
-        moved = np.packbits((np.abs(np.diff(inputs, axis=1)) > SAME).reshape(len(inputs), -1), axis=1)
+        moved = np.packbits(
+            (np.abs(np.diff(inputs, axis=1)) > SAME * self._condensed.input_prefix).reshape(len(inputs), -1),
+            axis=1,
+        )
         kinds, which = np.unique(moved, axis=0, return_inverse=True)
         firsts = [int(np.flatnonzero(which == kind)[0]) for kind in range(len(kinds))]
         costs = np.array([self._cost(self._allowance(moved[s].tobytes(), inputs[s])) for s in firsts])
@@ -186,7 +191,9 @@ def batched_plans(controller: Controller, preview: bool) -> BatchedPlans | None:
     if type(controller) is not MAMPC or type(controller.method) is not Exact:
         return None
     problem = controller.problem
-    admissible = AdmissiblePatterns(controller.rules, problem.model.n_inputs, problem.control_horizon)
+    admissible = AdmissiblePatterns(
+        controller.rules, problem.model.n_inputs, problem.control_horizon, controller.condensed.input_prefix
+    )
     if admissible.unrestricted:
         return BatchedPlans(controller, preview)
     if admissible.sized:

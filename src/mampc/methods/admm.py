@@ -16,7 +16,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
 from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals
-from mampc.methods.splitting import FirstStep
+from mampc.methods.splitting import FirstStep, mean_curvature
 from mampc.moves.admissible import Allowance
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
@@ -57,16 +57,16 @@ class ADMMSearch(HeuristicSearch):
     def __init__(self, settings: ADMM, condensed: CondensedQP, rules: MoveRules) -> None:
         super().__init__(settings, condensed, rules)
         self.settings = settings
-        self._first_step = FirstStep(condensed, settings.penalty * float(np.diag(condensed.H).mean()))
+        self._first_step = FirstStep(condensed, settings.penalty * mean_curvature(condensed))
         self._random = np.random.default_rng(settings.seed).standard_normal(
             (settings.starts, condensed.n_moves)
         )
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         first_step, mu = self._first_step, self._first_step.mu
-        data, unlimited = first_step.begin(sample), sample.moves
+        data, unlimited, prefix = first_step.begin(sample), sample.moves, self.condensed.move_prefix
         starts = [np.zeros(len(unlimited)), unlimited] + ([guess] if guess is not None else [])
-        starts += list(self._random * np.abs(unlimited).max())
+        starts += list(self._random * prefix * (np.abs(unlimited) / prefix).max())
         proposed, rounds, moves = set(), 0, None
         for v in starts[: self.settings.starts]:
             w = np.zeros(len(v))

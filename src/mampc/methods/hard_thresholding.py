@@ -24,7 +24,7 @@ class HardThresholding(Heuristic):
     """Settings of iterative hard thresholding.
 
     Args:
-        tolerance: stop when no move changes by more, in input units.
+        tolerance: stop when no move changes by more, in input units (with the prefix of `base.tolerances`).
         max_iterations: gradient steps at most.
     """
 
@@ -46,12 +46,15 @@ class HardThresholdingSearch(HeuristicSearch):
     def __init__(self, settings: HardThresholding, condensed: CondensedQP, rules: MoveRules) -> None:
         super().__init__(settings, condensed, rules)
         self.settings = settings
-        self._lipschitz = float(np.linalg.eigvalsh(condensed.H)[-1])
-        self._contraction = np.eye(condensed.n_moves) - condensed.H / self._lipschitz
+        prefix = condensed.move_prefix
+        H = condensed.H * np.outer(prefix, prefix)
+        self._lipschitz = float(np.linalg.eigvalsh(H)[-1])
+        self._contraction = np.eye(condensed.n_moves) - H / self._lipschitz
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
-        L, step = self._lipschitz, -self._priced_limits(sample) / self._lipschitz
-        d: Array = sample.moves if guess is None else guess
+        L, prefix = self._lipschitz, self.condensed.move_prefix
+        step = -self._priced_limits(sample) * prefix / L
+        d: Array = (sample.moves if guess is None else guess) / prefix
         pattern, rounds = d != 0, 0
         while rounds < self.settings.max_iterations:
             rounds += 1
@@ -61,4 +64,4 @@ class HardThresholdingSearch(HeuristicSearch):
             if np.abs(d - last).max() <= self.settings.tolerance:
                 break
         yield pattern
-        return Ended(rounds, d)
+        return Ended(rounds, d * prefix)

@@ -75,7 +75,9 @@ class HeuristicSearch:
     def __init__(self, settings: Heuristic, condensed: CondensedQP, rules: MoveRules) -> None:
         problem = condensed.problem
         self.condensed, self.rules, self._certify = condensed, rules, settings.certify
-        self.admissible = AdmissiblePatterns(rules, problem.model.n_inputs, problem.control_horizon)
+        self.admissible = AdmissiblePatterns(
+            rules, problem.model.n_inputs, problem.control_horizon, condensed.input_prefix
+        )
         self._solver = PatternSolver(condensed, self.admissible, most_programs=MOST_PROGRAMS)
 
     @cached_property

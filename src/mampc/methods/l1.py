@@ -16,6 +16,7 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_whole
 from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals, proposing
+from mampc.methods.splitting import mean_curvature
 from mampc.moves.admissible import Allowance
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
@@ -65,7 +66,7 @@ class L1Search(HeuristicSearch):
         full, v, n = condensed.program, condensed.n_violations, condensed.n_moves
         H = np.zeros((v + 2 * n, v + 2 * n))
         H[: v + n, : v + n] = full.H
-        H[v + n :, v + n :] = CURVATURE * np.diag(condensed.H).mean() * np.eye(n)
+        H[v + n :, v + n :] = CURVATURE * np.diag(mean_curvature(condensed))
         none, eye = np.zeros((n, v)), np.eye(n)
         A = np.block([[full.A, np.zeros((len(full.A), n))], [none, -eye, eye], [none, eye, eye]])
         # Next to that little curvature of t moves are small numbers.
@@ -73,25 +74,26 @@ class L1Search(HeuristicSearch):
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         proposed: dict[bytes, BoolArray] = {}
-        largest, rounds = np.abs(sample.moves).max(), 0
-        c = np.ones(self.condensed.n_moves)
+        prefix = self.condensed.move_prefix
+        largest, rounds = (np.abs(sample.moves) / prefix).max(), 0
+        c = 1 / prefix
         self._program.start()
         for _ in range(self.settings.reweightings + 1):
             d, programs = self._weighed(sample, allowance, c, ZERO * largest, proposed)
             rounds += programs
-            c = 1 / (np.abs(d) + 0.1 * largest + 1e-300)
-            c /= c.max()
+            c = 1 / (d + 0.1 * largest + 1e-300)
+            c /= c.max() * prefix
         return (yield from proposing(proposed.values(), Ended(rounds)))
 
     def _weighed(
         self, sample: Sample, allowance: Allowance, c: Array, zero: float, proposed: dict[bytes, BoolArray]
     ) -> tuple[Array, int]:
-        """Moves under the least weight that meets the rules (or the last of a path), and programs solved."""
+        """Sizes of the moves under the least weight that meets the rules (or a path's last), and programs solved."""
         n = self.condensed.n_moves
         none = np.zeros(2 * n)
         lower = np.concatenate([sample.lower, none])
         upper = np.concatenate([sample.upper, none + UNBOUNDED])
-        high = np.log(max(np.abs(sample.f_moves).max(), 1e-12) / c.min())
+        high = np.log(max((np.abs(sample.f_moves) / c).max(), 1e-12))
         low = high - np.log(1e6)
         met: Array = np.zeros(n)
         path = np.linspace(low, high, WEIGHTS, endpoint=False)[::-1] if self.admissible.priced else None
@@ -102,8 +104,8 @@ class L1Search(HeuristicSearch):
             solution = self._program.solve(f, lower, upper)
             if solution.z is None:
                 break
-            d = solution.z[-2 * n : -n]
-            size = np.where(np.abs(d) > zero, np.abs(d), 0.0)
+            all_sizes = np.abs(solution.z[-2 * n : -n]) / self.condensed.move_prefix
+            size = np.where(all_sizes > zero, all_sizes, 0.0)
             admissible = self.admissible.allows(size > 0, allowance)
             # Above any price: here size alone decides, and prices when the patterns are polished.
             pattern = self.admissible.select(
@@ -111,7 +113,7 @@ class L1Search(HeuristicSearch):
             )
             proposed[pattern.tobytes()] = pattern
             if admissible:
-                met, high = d, logarithm
+                met, high = all_sizes, logarithm
             else:
                 low = logarithm
         return met, count

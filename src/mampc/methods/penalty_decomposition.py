@@ -14,7 +14,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
 from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, Proposals
-from mampc.methods.splitting import FirstStep, alternate
+from mampc.methods.splitting import FirstStep, alternate, mean_curvature
 from mampc.moves.admissible import Allowance
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
@@ -58,30 +58,32 @@ class PenaltyDecompositionSearch(HeuristicSearch):
     def __init__(self, settings: PenaltyDecomposition, condensed: CondensedQP, rules: MoveRules) -> None:
         super().__init__(settings, condensed, rules)
         self.settings = settings
-        self._mu = settings.penalty * float(np.diag(condensed.H).mean())
+        self._mu = settings.penalty * mean_curvature(condensed)
         self._first_steps = [FirstStep(condensed, self._mu)]
-        self._largest_mu = 0.25 * LARGEST_CONDITION * float(np.linalg.eigvalsh(condensed.program.H)[0])
+        prefix = np.concatenate([np.ones(condensed.n_violations), condensed.move_prefix])
+        least = float(np.linalg.eigvalsh(condensed.program.H * np.outer(prefix, prefix))[0])
+        self._largest_mu = 0.25 * LARGEST_CONDITION * least / condensed.move_prefix**2
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         settings, rounds = self.settings, 0
         v: Array = np.zeros(self.condensed.n_moves) if guess is None else guess
         for number in range(MOST_GROWTHS):
             if number == len(self._first_steps):
-                if self._first_steps[-1].mu * settings.growth > self._largest_mu:
+                if (self._first_steps[-1].mu * settings.growth > self._largest_mu).any():
                     break
                 self._first_steps.append(FirstStep(self.condensed, self._mu * settings.growth**number))
             first_step = self._first_steps[number]
             mu = first_step.mu
             inner = alternate(
                 first_step, sample, v, lambda d, mu=mu: self.admissible.select(mu * d * d, allowance),  # type: ignore[misc]
-                settings.tolerance, settings.max_iterations,
+                settings.tolerance, settings.max_iterations, self.condensed.move_prefix,
             )  # fmt: skip
             rounds += inner.rounds
             # Not settled by its last round, the alternation goes on with the next mu.
             if inner.status not in (QPStatus.OPTIMAL, QPStatus.ITERATION_LIMIT):
                 return Ended(rounds, failure=inner.status)
             v = inner.v
-            if np.abs(inner.d - v).max() <= settings.tolerance:
+            if (np.abs(inner.d - v) / self.condensed.move_prefix).max() <= settings.tolerance:
                 break
         yield v != 0
         return Ended(rounds, v)

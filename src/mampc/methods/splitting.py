@@ -33,15 +33,19 @@ def alternate(
     choose: Callable[[Array], BoolArray],
     tolerance: float,
     most: int,
+    unit: Array | float = 1.0,
 ) -> Settled:
-    """Both steps by turns from v, until the planned inputs change by no more than the tolerance in sum."""
+    """Both steps by turns from v, until the planned inputs change by no more than the tolerance in sum.
+
+    They are counted in their `unit`, one for all moves or shape (n_moves,).
+    """
     data, u_last, d = first_step.begin(sample), None, v
     for rounds in range(1, most + 1):
         d, u, solved = first_step.minimise(data, v)
         if solved is not QPStatus.OPTIMAL:
             return Settled(d, v, rounds, solved)
         v = d * choose(d)
-        if u_last is not None and np.abs(u - u_last).sum() <= tolerance:
+        if u_last is not None and (np.abs(u - u_last) / unit).sum() <= tolerance:
             return Settled(d, v, rounds, QPStatus.OPTIMAL)
         u_last = u
     return Settled(d, v, most, QPStatus.ITERATION_LIMIT)
@@ -59,13 +63,13 @@ class FirstStepData(NamedTuple):
 
 
 class FirstStep:
-    """argmin J(d) + mu |v - d|^2 within the limits, for one mu.
+    """argmin J(d) + sum mu_i (v_i - d_i)^2 within the limits, for one mu, a number or shape (n_moves,).
 
     The unconstrained minimiser is affine in v, so it costs one product; the solver is called only when
     that minimiser breaks a limit.
     """
 
-    def __init__(self, condensed: CondensedQP, mu: float) -> None:
+    def __init__(self, condensed: CondensedQP, mu: Array | float) -> None:
         self.mu, self._violations = mu, condensed.n_violations
         full, v = condensed.program, condensed.n_violations
         H = full.H.copy()
@@ -100,3 +104,10 @@ class FirstStep:
             return d, d, solution.status
         d = solution.z[self._violations :]
         return d, self._cumulate @ d, QPStatus.OPTIMAL
+
+
+def mean_curvature(condensed: CondensedQP) -> Array:
+    """The mean curvature of the cost in the moves, as weights, shape (n_moves,), that mean the same in all units."""
+    prefix = condensed.move_prefix
+    curvature: Array = (np.diag(condensed.H) * prefix**2).mean() / prefix**2
+    return curvature

@@ -34,6 +34,8 @@ class Allowance(NamedTuple):
 class AdmissiblePatterns:
     """The admissible patterns of `MoveRules` for m inputs over nc samples.
 
+    The prefix of each input, (m,), see `tolerances`, tells its past moves from rounding.
+
     Attributes:
         candidates: moves that some admissible pattern holds, shape (n_moves,).
         price: of each input, shape (m,); with simultaneous counting the price of a sample.
@@ -42,7 +44,9 @@ class AdmissiblePatterns:
         simple: whether moves compete for the budget alone, one for one.
     """
 
-    def __init__(self, rules: MoveRules, n_inputs: int, control_horizon: int) -> None:
+    def __init__(
+        self, rules: MoveRules, n_inputs: int, control_horizon: int, input_prefix: Array | float = 1.0
+    ) -> None:
         self.rules, self.n_inputs, self.control_horizon = rules, n_inputs, control_horizon
         m, n_c = n_inputs, control_horizon
         self.n_moves = n_c * m
@@ -65,6 +69,7 @@ class AdmissiblePatterns:
         self.simple = rules.dwell == 1 and self.per_step == m and not self.simultaneous
         self._most = n_c if self.simultaneous else self.n_moves
         self._all_free = (0,) * m
+        self._same = SAME * input_prefix
 
     @property
     def unrestricted(self) -> bool:
@@ -82,16 +87,23 @@ class AdmissiblePatterns:
         if rules.max_moves is not None:
             left = rules.max_moves
             if rules.sparsity_horizon > 1:
-                left -= self._count(_moved(inputs[-rules.sparsity_horizon :]))
+                left -= self._count(self._moved(inputs[-rules.sparsity_horizon :]))
                 exceeded = left < 0
             left = min(max(left, 0), self._most)
         if rules.dwell > 1:
-            moved = _moved(inputs[-rules.dwell :])[::-1]  # moved[t]: t + 1 samples before the next decision
+            moved = self._moved(inputs[-rules.dwell :])[
+                ::-1
+            ]  # moved[t]: t + 1 samples before the next decision
             since = np.where(moved.any(axis=0), moved.argmax(axis=0) + 1, rules.dwell)
             until = tuple((rules.dwell - since).tolist())
         if frozen is not None:
             until = tuple(np.maximum(frozen, until).tolist())
         return Allowance(left, until, exceeded)
+
+    def _moved(self, inputs: Array) -> BoolArray:
+        """Which inputs changed between successive rows, shape (h - 1, m)."""
+        moved: BoolArray = np.abs(inputs[1:] - inputs[:-1]) > self._same
+        return moved
 
     def open(self, allowance: Allowance) -> BoolArray:
         """The moves of inputs that are not frozen, at the starts of blocks, shape (n_moves,)."""
@@ -222,9 +234,3 @@ class PatternBuilder:
         self._at[j] -= 1
         self._when[a].remove(j)
         self._used -= not self._of.simultaneous or self._at[j] == 0
-
-
-def _moved(inputs: Array) -> BoolArray:
-    """Which inputs changed between successive rows, shape (h - 1, m)."""
-    moved: BoolArray = np.abs(inputs[1:] - inputs[:-1]) > SAME
-    return moved

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
-from mampc.base.tolerances import ROUNDING
+from mampc.base.tolerances import ROUNDING, SMALLER
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.rounding import without_rounding
 from mampc.moves.signs import search_signs
@@ -108,7 +108,7 @@ class PatternSolver:
                 nearest.iterations,
             )  # fmt: skip
         signed = search_signs(
-            restriction, nearest, optimum, kept, sizes,
+            restriction, nearest, optimum, kept, sizes, SMALLER * self.condensed.move_prefix[pattern],
             cutoff=cutoff - base, most=self._most_programs, deadline=deadline,
         )  # fmt: skip
         if signed.moves is None:
@@ -155,7 +155,7 @@ class PatternSolver:
             return OnPattern(None, objective, QPStatus.OPTIMAL, multipliers, iterations)
         moves: Array = np.zeros(self.condensed.n_moves)
         moves[pattern] = chosen
-        if len(chosen) and np.abs(chosen).min() < ROUNDING:
+        if (np.abs(chosen) < ROUNDING * self.condensed.move_prefix[pattern]).any():
             moves = without_rounding(self.condensed, sample, moves)
             objective = self.condensed.cost(sample, moves) + self.admissible.charge(moves != 0)
         return OnPattern(moves, objective, QPStatus.OPTIMAL, multipliers, iterations)

@@ -12,7 +12,7 @@ from mampc.program.sample import Sample
 
 def without_rounding(condensed: CondensedQP, sample: Sample, moves: Array) -> Array:
     """The moves with inputs exactly within their limits, and changes too small to count exactly zero."""
-    small = np.abs(moves)
+    small = np.abs(moves) / condensed.move_prefix
     nothing = small <= NOTHING
     if (nothing | (small > ROUNDING)).all():
         return np.where(nothing, 0.0, moves)
@@ -22,5 +22,5 @@ def without_rounding(condensed: CondensedQP, sample: Sample, moves: Array) -> Ar
     changes: Array = inputs[1:] - inputs[:-1]
     if sample.frozen is not None:  # in manual, wherever that is
         changes[:, ~moves.reshape(changes.shape).any(axis=0)] = 0.0
-    changes[np.abs(changes) <= SAME] = 0.0
+    changes[np.abs(changes) <= SAME * condensed.input_prefix] = 0.0
     return changes.ravel()

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.base.tolerances import SMALLER
 from mampc.program.least_distance import Nearest
 from mampc.program.qp import QPStatus
 from mampc.program.restriction import Restriction
@@ -38,6 +37,7 @@ def search_signs(
     optimum: Array,
     bounds: tuple[Array, Array],
     sizes: Array,
+    rounding: Array,
     *,
     cutoff: float = np.inf,
     most: float = np.inf,
@@ -51,6 +51,7 @@ def search_signs(
         optimum: its optimum without limits, shape (k,).
         bounds: lower and upper ones, those that the restriction keeps.
         sizes: least sizes, shape (k,).
+        rounding: by how much a move may fall short of its size for rounding, shape (k,).
         cutoff: moves with a larger excess are of no interest.
         most: programs that the search may take.
         deadline: of `perf_counter`; one program is solved whatever the time is.
@@ -62,8 +63,8 @@ def search_signs(
     while True:
         if node.moves is not None and node.excess < least:
             short = sizes - np.abs(node.moves)
-            worst = int(short.argmax())
-            if short[worst] > SMALLER:
+            worst = int((short / rounding).argmax())
+            if short[worst] > rounding[worst]:
                 pending += _apart(lower, upper, first_move + worst, sizes[worst], node.moves[worst])
             else:
                 best = np.where(short > 0, np.copysign(sizes, node.moves), node.moves)

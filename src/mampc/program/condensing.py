@@ -26,6 +26,7 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray, ComplexArray
 from mampc.base.errors import MampcError
+from mampc.base.tolerances import prefix
 from mampc.program.bounds import Bounds
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
@@ -50,6 +51,8 @@ class CondensedQP:
         plain: the problem with every move free, which is plain MPC; whoever solves it shares its solver.
         lengths: of U's columns, shape (n_moves,).
         condition: of U with columns of length 1, so that units do not count.
+        input_prefix: power of a thousand in which each input is a number of ordinary size, shape (m,).
+        move_prefix: the same for every move, shape (n_moves,).
         parameter: where each quantity stands in p.
         bounds: which quantities are bounded, and between what.
         theta: predicted outputs per move, shape ((np + 1) l, n_moves).
@@ -93,6 +96,9 @@ class CondensedQP:
         if not problem.weigh_first_move:
             self.R[:m, :m] = 0.0
         self._triangularise()
+        width = problem.limits.u_max - problem.limits.u_min
+        self.input_prefix = prefix(np.square(self.U[:, :m]).sum(axis=0), width)
+        self.move_prefix = np.tile(self.input_prefix, n_c)
 
         f = parameter.no_map(v + n)
         f[:v, parameter.one] = problem.output_limit_weight

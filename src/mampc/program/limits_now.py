@@ -167,7 +167,7 @@ class LimitsNow:
             bound_of_move[:m] = np.arange(v, n_simple)
         bounds_now = BoundsNow(
             np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), condensed.bounds.of_moves,
-            self.inputs.low - u, self.inputs.high - u, bound_of_move,
+            self.inputs.low - u, self.inputs.high - u, bound_of_move, condensed.input_prefix,
         )  # fmt: skip
         return Sample(
             sample.data, sample.parts, sample.parameter, sample.u_previous, sample.frozen, bounds_now

@@ -145,11 +145,20 @@ class BoundsNow:
         bounded_rows: the bounded quantities per move, those of the violations left out.
         low, high: least and largest u_j - u_previous, shape (nc, m).
         bound_of_move: which bound limits the input after each move, shape (n_moves,); -1 for none.
+        input_prefix: see `tolerances`, shape (m,).
     """
 
     def __init__(
-        self, lower: Array, upper: Array, bounded_rows: Array, low: Array, high: Array, bound_of_move: Indices
+        self,
+        lower: Array,
+        upper: Array,
+        bounded_rows: Array,
+        low: Array,
+        high: Array,
+        bound_of_move: Indices,
+        input_prefix: Array,
     ) -> None:
+        self._kept = KEPT * input_prefix
         self.lower, self.upper, self._rows = lower, upper, bounded_rows
         self._low, self._high, self._bound_of_move = low, high, bound_of_move.reshape(low.shape)
 
@@ -172,7 +181,7 @@ class BoundsNow:
             at, known = self._bound_of_move[j][now], self._bound_of_move[j][now] >= 0
             lower[at[known]], upper[at[known]] = low[now][known], high[now][known]
             low[now], high[now] = -np.inf, np.inf
-        return (lower, upper) if (low <= KEPT).all() and (high >= -KEPT).all() else None
+        return (lower, upper) if (low <= self._kept).all() and (high >= -self._kept).all() else None
 
 
 class PatternOptimum:

@@ -64,7 +64,9 @@ class ExactSearch:
     def __init__(self, settings: Exact, condensed: CondensedQP, rules: MoveRules) -> None:
         problem = condensed.problem
         self.settings, self.condensed = settings, condensed
-        self.admissible = AdmissiblePatterns(rules, problem.model.n_inputs, problem.control_horizon)
+        self.admissible = AdmissiblePatterns(
+            rules, problem.model.n_inputs, problem.control_horizon, condensed.input_prefix
+        )
         self._relaxation = Relaxation(condensed)
         self._ranking = ranking_of(condensed, self.admissible)
         self._solver = PatternSolver(condensed, self.admissible)
