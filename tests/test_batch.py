@@ -223,6 +223,11 @@ def test_the_best_pattern_is_that_of_the_search():
     [
         ({"seeds": []}, "seeds: expected at least one"),
         ({"seeds": [-1]}, "seeds: expected a whole number"),
+        ({"seeds": 5}, "seeds: expected whole numbers"),
+        ({"seeds": [0], "plant": None}, "plant: expected a plant"),
+        ({"seeds": [0], "reference": [[1.0], [1.0, 2.0]]}, "reference: expected real numbers"),
+        ({"seeds": [0], "output_disturbance": "much"}, "output_disturbance: expected real numbers"),
+        ({"seeds": [0], "valves": 1.0}, "valves: expected mampc.Valves"),
         (
             {"seeds": [0, 1], "output_disturbance": np.zeros((3, 20, 2))},
             "output_disturbance: expected a course",
@@ -235,7 +240,10 @@ def test_the_best_pattern_is_that_of_the_search():
 )
 def test_arguments_that_do_not_fit_are_refused(options, message):
     with pytest.raises(mampc.MampcError, match=message):
-        mampc.simulate_batch(TANK, regulator(tank_problem()), tank_reference(20), **options)
+        mampc.simulate_batch(
+            **{"plant": TANK, "regulator": regulator(tank_problem()), "reference": tank_reference(20)}
+            | options
+        )
 
 
 def test_a_list_of_plants_needs_one_per_seed():

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import LARGEST, Array, BoolArray, as_flag, as_whole
-from mampc.base.errors import MampcError
+from mampc.base.checks import LARGEST, Array, BoolArray, as_array, as_flag, as_whole
+from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.loop.batched_plans import BatchedPlans, batched_plans
@@ -119,6 +119,8 @@ def simulate_batch(
     Raises:
         MampcError: arguments that do not fit together, or a plant that cannot be integrated.
     """
+    if not isinstance(seeds, Iterable) or isinstance(seeds, str):
+        raise MampcError(f"seeds: expected whole numbers such as range(100), received {shown(seeds)}")
     seeds = tuple(as_whole("seeds", seed, 0) for seed in seeds)
     if not seeds:
         raise MampcError("seeds: expected at least one, received none")
@@ -131,17 +133,18 @@ def simulate_batch(
         "reference": reference, "input_disturbance": input_disturbance,
         "output_disturbance": output_disturbance, "measured_disturbance": measured_disturbance,
     }  # fmt: skip
+    each = {name for name, value in own.items() if value is not None and as_array(name, value).ndim == 3}
     for name, value in own.items():
-        if value is not None and np.ndim(value) == 3 and len(value) != len(seeds):
+        if name in each and len(value) != len(seeds):
             raise MampcError(
                 f"{name}: expected a course for each of {len(seeds)} seeds, received {len(value)}"
             )
     acting: list[Acting] = []
     for s in range(len(seeds)):
-        if s and plants[s] is plants[0] and not any(np.ndim(value) == 3 for value in own.values()):
+        if s and plants[s] is plants[0] and not each:
             acting.append(acting[0])
             continue
-        one = {name: value[s] if np.ndim(value) == 3 else value for name, value in own.items()}
+        one = {name: value[s] if name in each else value for name, value in own.items()}
         acting.append(
             acting_on(
                 plants[s], regulator, steps=steps, noise=noise, loads=loads, valves=valves, u_initial=u_initial,

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array, as_array, as_matrix, as_vector, as_whole
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, shown
+from mampc.base.names import Names
 from mampc.loop.loads import Load, drawn
 from mampc.loop.motion import Faults, motion_of
 from mampc.loop.regulator import Regulator
@@ -143,6 +144,8 @@ def acting_on(
     """What the arguments of `simulate` say, checked."""
     if not isinstance(regulator, Regulator):
         raise MampcError(f"regulator: expected a mampc.Regulator, received {type(regulator).__name__}")
+    if not isinstance(getattr(plant, "names", None), Names):
+        raise MampcError(f"plant: expected a plant or a mampc.StateSpace, received {shown(plant)}")
     model = regulator.controller.problem.model
     m, l, d = model.n_inputs, model.n_outputs, len(plant.names.disturbances)
     if (len(plant.names.inputs), len(plant.names.outputs)) != (m, l) or model.n_disturbances not in (0, d):
@@ -150,8 +153,9 @@ def acting_on(
             f"simulate: expected a plant with {m} inputs, {l} outputs and {model.n_disturbances} measured "
             f"disturbances, received {len(plant.names.inputs)}, {len(plant.names.outputs)} and {d}"
         )
+    reference = as_array("reference", reference)
     T = _length(reference, steps)
-    rows = _trajectory("reference", reference, l, None if np.ndim(reference) == 2 else T)
+    rows = _trajectory("reference", reference, l, None if reference.ndim == 2 else T)
     horizon = regulator.controller.problem.prediction_horizon
     spread = as_vector("noise", noise, l)
     if (spread < 0).any():
@@ -226,10 +230,10 @@ def at_rest(
     return x, regulator.initial_state(u, y, **told)
 
 
-def _length(reference: Any, steps: int | None) -> int:
+def _length(reference: Array, steps: int | None) -> int:
     if steps is not None:
         return as_whole("steps", steps, 1)
-    if np.ndim(reference) != 2:
+    if reference.ndim != 2:
         raise MampcError(
             "steps: expected a number of samples, since the reference is constant, received none"
         )
