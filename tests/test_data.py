@@ -125,9 +125,15 @@ def test_a_given_step_needs_no_time_column_and_contradicts_none(tmp_path):
         ("time,u,z\n0,1,2\n", r"expected one column 'y', received columns \['time', 'u', 'z'\]"),
         ("time,u,y,u\n0,1,2,3\n", "expected one column 'u', received columns"),
         ("u,y\n1,2\n3,4\n", "expected a column of times; .* pass the sample time"),
-        ("time,u,y\n0,1,2\n1,two,3\n", "expected consecutive rows with numbers, received none"),
+        (
+            "time,u,y\n0,1,2\n1,two,3\n",
+            "expected consecutive rows with a number in every column, received none",
+        ),
         ("time,u,y\n0,1,2\n1,2 m,3\n", "expected a number in row 3, column 'u', received '2 m'"),
-        ("time,u,y\n0,1,2\n\n\n1,2,\n", "expected consecutive rows with numbers, received none"),
+        (
+            "time,u,y\n0,1,2\n\n\n1,2,\n",
+            "expected consecutive rows with a number in every column, received none",
+        ),
         ("time,u,y\n0,1,2\n1,2,3\n3,4,5\n", "expected an evenly increasing time column"),
         ("time,u,y\n0,1,2\n0,2,3\n", "expected an evenly increasing time column"),
         ("time,u,y\n0,1,2\n", "expected an evenly increasing time column"),

@@ -13,8 +13,15 @@ from mampc.base.checks import Array
 from mampc.base.errors import shown
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.numbers import POINT, clean, is_number, numeric_share
-from mampc.identification.export.sheet import Cells, Sheet, find_column
-from mampc.identification.export.stamps import DATE_ONLY, SECONDS, TimeReading, from_stamps, since_first
+from mampc.identification.export.sheet import Sheet, find_column
+from mampc.identification.export.stamps import (
+    DATE_ONLY,
+    SECONDS,
+    TimeReading,
+    from_stamps,
+    iso_stamps,
+    since_first,
+)
 
 NAMES = re.compile(
     r"(time|t|timestamp|date|datetime|elapsed|seconds|zeit|zeitstempel|temps|tiempo|tempo|tijd|tid)([\W_].*)?"
@@ -67,28 +74,37 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     if not columns:
         return None
     name = " and ".join(sheet.header[at] for at in columns)
-    cells = sheet.column(columns[0])
-    if len(columns) == 2:
-        cells = [f"{day} {hour}".strip() for day, hour in zip(cells, sheet.column(columns[1]), strict=True)]
-    if not isinstance(cells, (list, np.ndarray)):
-        seconds, origin = since_first(cells, how, sheet, findings)
-    elif isinstance(cells, np.ndarray) or (how.time_format is None and numeric_share(cells[:200]) > 0.5):
-        seconds, origin = _from_numbers(sheet, columns[0], cells, how, findings), None
+    if len(columns) == 1 and how.time_format is None and numeric_share(_sampled(sheet, columns[0])) > 0.5:
+        seconds, origin = _from_numbers(sheet, columns[0], how, findings), None
+    elif (
+        len(columns) == 1
+        and how.time_format is None
+        and (stamps := iso_stamps(sheet.chunks(columns))) is not None
+    ):
+        seconds, origin = since_first(stamps, how, sheet, findings)
     else:
-        seconds, origin = from_stamps(cells, how, sheet, name, findings)
-    if isinstance(cells, list) and CLOCK_ONLY.fullmatch(cells[0]) and (np.diff(seconds) < 0).any():
-        findings.doubt(
-            f"times such as {cells[0]!r} in column {name!r} have no date and run past midnight; add one"
-        )
+        cells = sheet.column(columns[0])
+        if len(columns) == 2:
+            hours = sheet.column(columns[1])
+            cells = [f"{day} {hour}".strip() for day, hour in zip(cells, hours, strict=True)]
+        if not isinstance(cells, list):
+            seconds, origin = since_first(cells, how, sheet, findings)
+        else:
+            seconds, origin = from_stamps(cells, how, sheet, name, findings)
+            steps = np.diff(seconds)
+            if CLOCK_ONLY.fullmatch(cells[0]) and (steps < 0).any() and (steps > 0).any():
+                findings.doubt(
+                    f"times such as {cells[0]!r} in column {name!r} have no date and run past midnight; add one"
+                )
     unreadable = np.flatnonzero(np.isnan(seconds))
     if len(unreadable) == len(seconds):
         findings.doubt(
-            f"expected times in column {name!r}, received {shown(_cell(cells, 0))} in row {sheet.numbers[0]}; "
+            f"expected times in column {name!r}, received {_cell(sheet, columns, 0)} in row {sheet.numbers[0]}; "
             "pass their format (--time-format '%d/%m/%Y %H:%M'), or another column (--time)"
         )
         return None
     if len(unreadable):
-        examples = shown(_cell(cells, int(unreadable[0])))
+        examples = _cell(sheet, columns, int(unreadable[0]))
         findings.change(
             f"no time can be read in {rows_text(sheet.numbers[unreadable].tolist())} "
             f"(the first says {examples}); left out"
@@ -103,8 +119,8 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     return Clock(name, columns, seconds, origin)
 
 
-def _cell(cells: Cells, at: int) -> str:
-    return str(cells[at])
+def _cell(sheet: Sheet, columns: Sequence[int], at: int) -> str:
+    return shown(" ".join(str(sheet.column(column)[at]) for column in columns))
 
 
 def _time_columns(
@@ -179,14 +195,18 @@ def _runs_on(sheet: Sheet, at: int, share: float, *, evenly: bool = False) -> bo
     return usual not in (0.0, 1.0) and bool(np.mean(np.abs(steps - usual) <= 0.3 * abs(usual)) > share)
 
 
-def _from_numbers(sheet: Sheet, at: int, cells: Cells, how: TimeReading, findings: Findings) -> Array:
+def _from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) -> Array:
     name = sheet.header[at]
-    values = np.array(
-        [float(word) if POINT.fullmatch(word := clean(cell).replace(",", ".")) else np.nan for cell in cells]
-        if isinstance(cells, list)
-        else cells,
-        dtype=np.float64,
-    )
+    values = np.empty(len(sheet))
+    start = 0
+    for [cells] in sheet.chunks([at]):
+        part = values[start : start + len(cells)]
+        start += len(cells)
+        if isinstance(cells, list):
+            words = (clean(cell).replace(",", ".") for cell in cells)
+            part[:] = [float(word) if POINT.fullmatch(word) else np.nan for word in words]
+        else:
+            part[:] = cells
     found = re.search(r"_(ms|s|sec|min|h)$", name.casefold())
     unit = how.time_unit or sheet.units.get(at, "").casefold() or (found.group(1) if found else "")
     if unit in SECONDS:

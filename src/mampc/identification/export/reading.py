@@ -6,17 +6,18 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
+import numpy.typing as npt
 
-from mampc.base.checks import as_number
+from mampc.base.checks import Array, as_number
 from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.identification.data import IOData
-from mampc.identification.export.clock import read_clock
+from mampc.identification.export.clock import Clock, read_clock
 from mampc.identification.export.findings import Findings, counted
-from mampc.identification.export.grid import STRAYING, make_grid, pieces, resampled
+from mampc.identification.export.grid import STRAYING, Grid, make_grid, pieces, resampled
 from mampc.identification.export.numbers import Reading, read_numbers
 from mampc.identification.export.quality import drop_bad_quality, quality_columns
 from mampc.identification.export.sheet import find_column, open_sheet
@@ -100,41 +101,70 @@ def read_export(
         dt = as_number("dt", dt, 0.0, exclusive=True)
     how, reading = readings(options, wanted)
 
+    table = _read_table(source, names, how, reading, listed(options.get("good", ())), findings)
+    grid = make_grid(table.clock, table.values, table.numbers, dt, findings)
+    findings.require_none()
+    assert grid is not None  # else there is a doubt
+    records, starts = _cut(table, grid, findings)
+    if not records:
+        raise MampcError(f"{origin}: expected consecutive rows with a number in every column, received none")
+    return Export(tuple(records), tuple(findings.notes), tuple(findings.changes), tuple(starts))
+
+
+class _Table(NamedTuple):
+    """The wanted columns, inputs before disturbances before outputs; nothing else of the file is kept."""
+
+    names: Names
+    clock: Clock | None
+    values: Array
+    numbers: npt.NDArray[np.int64]
+
+
+def _read_table(
+    source: Any,
+    names: Names,
+    how: TimeReading,
+    reading: Reading,
+    good: Sequence[str],
+    findings: Findings,
+) -> _Table:
+    wanted = (*names.inputs, *names.disturbances, *names.outputs)
     sheet = open_sheet(source, wanted, findings)
     positions = {name: _position(sheet.header, name) for name in wanted}
     units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
-    names = replace(names, units=units)
     quality = tuple(quality_columns(sheet.header, positions))
     clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
     columns = read_numbers(sheet, positions, reading, findings)
-    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
+    drop_bad_quality(sheet, columns, positions, good, findings)
     for column in columns:
         if column.marks:
             findings.change(str(column))
     values = np.column_stack([column.values for column in columns])
-    grid = make_grid(clock, values, sheet.numbers, dt, findings)
-    findings.require_none()
-    assert grid is not None  # else there is a doubt
-    values = values[grid.order]
+    return _Table(replace(names, units=units), clock, values, sheet.numbers)
+
+
+def _cut(table: _Table, grid: Grid, findings: Findings) -> tuple[list[IOData], list[str]]:
+    """A record for each piece without a gap, and when it begins."""
+    names, clock, _, numbers = table
+    values = table.values
+    if not np.array_equal(grid.order, np.arange(len(values))):
+        values = values[grid.order]
     usable = np.asarray(np.isfinite(values).all(axis=1))
-    if not usable.any():
-        raise MampcError(f"{origin}: expected rows with a number in every column, received none")
-    m = len(names.inputs)
+    m, d = len(names.inputs), len(names.disturbances)
     records, starts, strays, short = [], [], 0.0, 0
-    for piece in pieces(grid, clock, usable, sheet.numbers, findings):
-        seconds = grid.seconds[piece]
-        held, changing, straying = resampled(seconds, values[piece, :m], values[piece, m:], grid.dt)
-        d = len(names.disturbances)
+    for piece in pieces(grid, clock, usable, numbers, findings):
+        whole = len(piece) == piece[-1] - piece[0] + 1  # rows beside each other are not copied
+        rows = slice(piece[0], piece[-1] + 1) if whole else piece
+        held, changing, straying = resampled(grid.seconds[rows], values[rows, :m], values[rows, m:], grid.dt)
         if len(held) < 2 <= len(usable):
             short += 1
             continue
         strays = max(strays, straying)
         records.append(IOData(np.hstack([held, changing[:, :d]]), changing[:, d:], grid.dt, names))
-        starts.append(clock(float(seconds[0])) if clock else f"row {sheet.numbers[grid.order[piece[0]]]}")
+        first = piece[0]
+        starts.append(clock(float(grid.seconds[first])) if clock else f"row {numbers[grid.order[first]]}")
     if short:
         findings.change(f"{counted(short, 'row')} between gaps on both sides left out")
-    if not records:
-        raise MampcError(f"{origin}: expected consecutive rows with numbers, received none")
     if strays > STRAYING:
         findings.change(
             f"times stray by up to {strays * grid.dt:.3g} s from even steps of {grid.dt:.8g} s: resampled, outputs on "
@@ -144,7 +174,7 @@ def read_export(
         findings.note(
             f"times stray by up to {strays * grid.dt:.2g} s from even steps of {grid.dt:.8g} s; taken as even"
         )
-    return Export(tuple(records), tuple(findings.notes), tuple(findings.changes), tuple(starts))
+    return records, starts
 
 
 def read_one(source: Any, **options: Any) -> IOData:

@@ -6,16 +6,16 @@ import csv
 import difflib
 import io
 import re
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
 from mampc.base.files import read_bounded
 from mampc.identification.export.findings import Findings, rows_text
@@ -34,7 +34,8 @@ BINARY = re.compile(rb"[\x00-\x08\x0e-\x19\x1c-\x1f]|\x1a(?!\s*$)")
 
 # Words as they stand, numbers, or a pandas Series of times.
 Cells: TypeAlias = "list[str] | npt.NDArray[Any] | pd.Series"
-Row: TypeAlias = tuple[int, Sequence[str]]  # its number in the file, its cells
+Row: TypeAlias = tuple[int, list[str]]  # its number in the file, its cells
+Rows: TypeAlias = Callable[[], Iterator[list[Row]]]  # all rows from the first on, in blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,8 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
     Raises:
         MampcError: no such file, or nothing in it that could be such a table.
     """
+    from mampc.identification.export.frame import frame_sheet
+
     if not isinstance(source, (str, Path)):
         return frame_sheet(source, names, findings)
     content = read_bounded(source, FILE_LIMIT, KIND)
@@ -102,13 +105,13 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
         )
     encoding = _encoding(source, content, findings)
 
-    def parsed(separator: str) -> Callable[[], Iterator[Row]]:
-        def rows() -> Iterator[Row]:
+    def parsed(separator: str) -> Rows:
+        def rows() -> Iterator[list[Row]]:
             text = io.TextIOWrapper(io.BytesIO(content), encoding=encoding, newline="")
             reader = csv.reader(text, delimiter=separator)
             try:
-                for row in reader:
-                    yield reader.line_num, row
+                while block := [(reader.line_num, row) for row in islice(reader, CHUNK)]:
+                    yield block
             except (csv.Error, UnicodeError) as error:
                 raise MampcError(
                     f"{source}: expected a readable {KIND}, received in row {reader.line_num}: {error}"
@@ -117,61 +120,6 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
         return rows
 
     return _row_sheet([(separator, parsed(separator)) for separator in SEPARATORS], names, findings)
-
-
-def frame_sheet(frame: Any, names: Sequence[str], findings: Findings) -> Sheet:
-    """The columns of a pandas DataFrame, and its index where that has a name or is one of times."""
-    import pandas as pd
-
-    if not isinstance(frame, pd.DataFrame):
-        raise MampcError(f"expected a pandas DataFrame, received {shown(type(frame).__name__)}")
-    if frame.columns.nlevels != 1 or frame.index.nlevels != 1:
-        raise MampcError("DataFrame: expected columns and an index of one level each")
-    if frame.index.name is not None or isinstance(frame.index, pd.DatetimeIndex):
-        index = frame.index.to_series(index=range(len(frame)))
-        frame = frame.reset_index(drop=True)
-        frame.insert(0, "index" if index.name is None else index.name, index, allow_duplicates=True)
-    if frame.empty:
-        raise MampcError(
-            f"{findings.origin}: expected a header and rows of numbers, received {len(frame)} rows"
-        )
-    header = tuple(str(name).strip() for name in frame.columns)
-    _require_columns(header, names, findings)
-
-    def chunks(columns: Sequence[int]) -> Iterator[list[Cells]]:
-        yield [_frame_cells(frame.iloc[:, at]) for at in columns]
-
-    head = frame.iloc[:50]
-    sample = [
-        list(row)
-        for row in zip(*(_words(_frame_cells(head.iloc[:, at])) for at in range(len(header))), strict=True)
-    ]
-    return Sheet(header, _header_units(header), np.arange(len(frame)), chunks, None, sample)
-
-
-def _frame_cells(column: Any) -> Cells:
-    import pandas as pd
-
-    if pd.api.types.is_bool_dtype(column.dtype):
-        return _texts(column)
-    if pd.api.types.is_numeric_dtype(column.dtype) and not pd.api.types.is_complex_dtype(column.dtype):
-        numbers: Array = column.to_numpy(dtype=np.float64, na_value=np.nan)
-        return numbers
-    if pd.api.types.is_datetime64_any_dtype(column.dtype):
-        times: Any = column.reset_index(drop=True)
-        return times
-    return _texts(column)
-
-
-def _texts(column: Any) -> list[str]:
-    return [
-        "" if missing else str(cell).strip()
-        for cell, missing in zip(column.tolist(), column.isna().tolist(), strict=True)
-    ]
-
-
-def _words(cells: Cells) -> list[str]:
-    return cells if isinstance(cells, list) else ["" if cell != cell else str(cell) for cell in cells]
 
 
 def _encoding(path: str | Path, content: bytes, findings: Findings) -> str:
@@ -195,14 +143,14 @@ def _encoding(path: str | Path, content: bytes, findings: Findings) -> str:
 
 
 def _row_sheet(
-    readings: Sequence[tuple[str | None, Callable[[], Iterator[Row]]]],
+    readings: Sequence[tuple[str | None, Rows]],
     names: Sequence[str],
     findings: Findings,
 ) -> Sheet:
     """The table in rows, read in the one of several ways that has the wanted columns."""
     heads = []
     for separator, rows in readings:
-        head = [(number, _stripped(row)) for number, row in islice(rows(), HEAD)]
+        head = [(number, _stripped(row)) for number, row in next(rows(), [])[:HEAD]]
         head = [(number, row) for number, row in head if any(row)]
         heads.append((separator, rows, head))
     if not any(head for _, _, head in heads):
@@ -229,12 +177,12 @@ def _row_sheet(
             f"{shown(' '.join(cell for cell in head[0][1] if cell))}"
         )
     if names:
-        _require_columns(header, names, findings)
+        require_columns(header, names, findings)
     return _measured(rows, separator, header_number, header, names, findings)
 
 
 def _measured(
-    rows: Callable[[], Iterator[Row]],
+    rows: Rows,
     separator: str | None,
     header_number: int,
     header: tuple[str, ...],
@@ -244,14 +192,14 @@ def _measured(
     """Go through all rows once: which are data, which are the header's, which have cells missing or too many."""
     width = len(header)
     positions = [at for name in names if (at := find_column(header, name)) is not None] or list(range(width))
-    numbers: list[int] = []
+    numbers = array("q")
     descriptions: list[tuple[int, list[str]]] = []
     ragged: list[tuple[int, list[str]]] = []
     broken: list[int] = []
     repeated: list[int] = []
     sample: list[list[str]] = []
     previous = header_number
-    for number, row in _from(rows, header_number):
+    for number, row in chain.from_iterable(_from(rows, header_number)):
         tall, previous = number - previous > 1 and any("\n" in cell or "\r" in cell for cell in row), number
         if len(row) != width:
             cells = _stripped(row)
@@ -298,7 +246,7 @@ def _measured(
             else f"{findings.origin}: expected rows of numbers under the header, received "
             f"{shown(descriptions[0][1], 200)} in row {descriptions[0][0]}"
         )
-    units = _header_units(header)
+    units = header_units(header)
     if descriptions:
         findings.note(
             f"{rows_text([number for number, _ in descriptions])} under the header hold no numbers: "
@@ -311,24 +259,25 @@ def _measured(
             units = {at: unit for at, unit in enumerate(rows_of_units[-1][:width]) if unit} | units
 
     def chunks(columns: Sequence[int]) -> Iterator[list[Cells]]:
-        data = (
-            row
-            for number, row in _from(rows, header_number)
-            if number not in skipped and (len(row) == width or any(_stripped(row)))
-        )
-        while part := list(islice(data, CHUNK)):
+        for block in _from(rows, header_number):
+            part = [
+                row
+                for number, row in block
+                if number not in skipped and (len(row) == width or any(_stripped(row)))
+            ]
             yield [[row[at].strip() for row in part] for at in columns]
 
     return Sheet(header, units, np.array(numbers, dtype=np.int64), chunks, separator, sample)
 
 
-def _from(rows: Callable[[], Iterator[Row]], header_number: int) -> Iterator[Row]:
+def _from(rows: Rows, header_number: int) -> Iterator[list[Row]]:
     """The rows under the header that are not blank."""
-    return ((number, row) for number, row in rows() if row and number > header_number)
+    for block in rows():
+        yield [line for line in block if line[1] and line[0] > header_number]
 
 
 def _without_footer(
-    ragged: list[tuple[int, list[str]]], numbers: list[int], findings: Findings
+    ragged: list[tuple[int, list[str]]], numbers: Sequence[int], findings: Findings
 ) -> list[tuple[int, list[str]]]:
     """Without the last rows where they hold one cell each, such as "594 rows exported"."""
     footer = [
@@ -383,12 +332,12 @@ def _likeliest_header(head: Sequence[tuple[int, list[str]]]) -> int:
     return 0
 
 
-def _header_units(header: Sequence[str]) -> dict[int, str]:
+def header_units(header: Sequence[str]) -> dict[int, str]:
     found = {at: UNIT.search(name) for at, name in enumerate(header)}
     return {at: match.group(1) for at, match in found.items() if match}
 
 
-def _require_columns(header: Sequence[str], names: Sequence[str], findings: Findings) -> None:
+def require_columns(header: Sequence[str], names: Sequence[str], findings: Findings) -> None:
     missing = [name for name in names if find_column(header, name) is None]
     for name in missing:
         close = difflib.get_close_matches(name, header, n=1)

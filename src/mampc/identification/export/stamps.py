@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -68,12 +68,42 @@ class TimeReading:
                 ) from None
 
 
+def iso_stamps(blocks: Iterable[Sequence[Cells]]) -> Any:
+    """Stamps in ISO's form as pandas has them, block by block: the words of a long file are never all there.
+
+    None where the cells are no words, or mostly in another form, or some have an offset from UTC and others none.
+    """
+    import pandas as pd
+
+    parts: list[Any] = []
+    offsets = None
+    for [cells] in blocks:
+        if not isinstance(cells, list):
+            return None
+        kinds = {_has_offset(cell) for cell in cells if cell} | ({offsets} - {None})
+        if len(kinds) != 1:
+            return None
+        offsets = kinds.pop()
+        stamps = pd.to_datetime(
+            pd.Series(cells, dtype=object), format="ISO8601", errors="coerce", utc=bool(offsets)
+        )
+        if stamps.notna().mean() < 0.9:
+            return None
+        parts.append(stamps)
+    return pd.concat(parts, ignore_index=True)
+
+
+def _has_offset(cell: str) -> bool:
+    signed = cell[-1:] == "Z" or "+" in cell or "-" in cell[-6:]
+    return signed and OFFSET.fullmatch(cell) is not None and DATE_ONLY.fullmatch(cell) is None
+
+
 def from_stamps(
     cells: Cells, how: TimeReading, sheet: Sheet, name: str, findings: Findings
 ) -> tuple[Array, Any]:
     """Seconds after the first stamp, and that stamp."""
-    words = [re.sub(r"\s+", " ", cell.strip()) for cell in cells]
-    offsets = [cell for cell in words if OFFSET.fullmatch(cell) and not DATE_ONLY.fullmatch(cell)]
+    words = [" ".join(cell.split()) for cell in cells]
+    offsets = [cell for cell in words if _has_offset(cell)]
     if offsets and len(offsets) < 0.9 * sum(map(bool, words)):
         findings.doubt(
             f"some times in column {name!r} have an offset from UTC such as {offsets[0]!r}, others have none"
@@ -116,7 +146,9 @@ def _readings(words: list[str], how: TimeReading, offsets: bool) -> Iterator[Any
         except ValueError as error:
             raise MampcError(f"time_format: expected a format as strptime has it, received {error}") from None
         return
-    points = series.str.replace(r"(\d),(\d+)", r"\1.\2", regex=True)
+    points = series
+    if any("," in word for word in words):
+        points = series.str.replace(r"(\d),(\d+)", r"\1.\2", regex=True)
     iso = pd.to_datetime(points, format="ISO8601", errors="coerce", utc=offsets)
     if iso.notna().mean() > 0.5:
         yield iso

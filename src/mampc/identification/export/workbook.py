@@ -17,8 +17,8 @@ CELL_LIMIT = 50_000_000
 INSTALL = "pip install 'mampc[data]'"
 
 
-def read_workbook(path: Any, content: bytes) -> list[Callable[[], Iterator[tuple[int, list[str]]]]]:
-    """One function a worksheet of an .xlsx file, which yields its rows as words with their numbers.
+def read_workbook(path: Any, content: bytes) -> list[Callable[[], Iterator[list[tuple[int, list[str]]]]]]:
+    """One function a worksheet of an .xlsx file, which yields its rows as words with their numbers, in one block.
 
     Raises:
         MampcError: openpyxl is missing, the file is damaged, or unpacks to more than `UNPACKED_LIMIT`.
@@ -34,13 +34,13 @@ def read_workbook(path: Any, content: bytes) -> list[Callable[[], Iterator[tuple
                     f"{path}: expected an Excel file that unpacks to {UNPACKED_LIMIT / 2**30:g} GiB at most"
                 )
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
-        readers: list[Callable[[], Iterator[tuple[int, list[str]]]]] = []
+        readers: list[Callable[[], Iterator[list[tuple[int, list[str]]]]]] = []
         for worksheet in book.worksheets:
             rows = [
                 (number, [_word(cell) for cell in row])
                 for number, row in enumerate(worksheet.iter_rows(values_only=True), 1)
             ]
-            readers.append(partial(iter, rows))
+            readers.append(partial(iter, [rows]))
     except MampcError:
         raise
     except Exception as error:  # whatever a damaged file makes of the libraries that unpack it
