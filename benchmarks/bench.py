@@ -133,6 +133,28 @@ def regulator_against_mpc() -> Row:
     return Row("Regulator.step / MPC step", "at most 3", f"{times.ratio:.2f}", str(times), times.ratio <= 3)
 
 
+def load_bank_against_filter() -> Row:
+    """A step of plain MPC with a load bank against one with a Kalman filter, on the same measurements."""
+    mpc = mampc.MPC(tank_problem())
+    regulators = (
+        mampc.Regulator(mpc, mampc.LoadBank(mpc.problem.model, noise=0.1)), mampc.Regulator(mpc)
+    )  # fmt: skip
+    y_op, calls = mpc.problem.model.y_op, []
+    for regulator in regulators:
+        state, noise, steps = regulator.initial_state(), np.random.default_rng(0), []
+        for _ in range(145):
+            steps.append(
+                partial(regulator.step, state, y_op + 0.1 * noise.standard_normal(len(y_op)), y_op + 1.0)
+            )
+            state = steps[-1]().state
+        calls.append(steps)
+    times = interleaved([(calls[0], calls[1])] * 100)
+    return Row(
+        "Regulator.step with a load bank / with a Kalman filter", "at most 3", f"{times.ratio:.2f}", str(times),
+        times.ratio <= 3,
+    )  # fmt: skip
+
+
 def alternating_against_cvxpy() -> Row:
     """The alternating method per step against the transcription, on the same samples."""
     problem = tank_problem()
@@ -184,6 +206,7 @@ ROWS: list[Callable[[], Row]] = [
     partial(mpc_against_bare_daqp, bounds=False),
     partial(mpc_against_bare_daqp, bounds=True),
     regulator_against_mpc,
+    load_bank_against_filter,
     alternating_against_cvxpy,
     *batches.ROWS,
     *sparse.ROWS,

@@ -111,3 +111,11 @@ def same_decision(a, b, atol=1e-12):
 def sample_data(condensed, u_previous, **parameter):
     """The condensed data of one sample."""
     return condensed.sample(condensed.parameter.vector(u_previous=u_previous, **parameter), u_previous)
+
+
+def load_bank(problem):
+    """A load bank for a problem, which guesses the noise where it can."""
+    try:
+        return mampc.LoadBank.for_problem(problem)
+    except mampc.MampcError:
+        return mampc.LoadBank(problem.model, noise=0.05)

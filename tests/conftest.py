@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 
+from builders import load_bank
 from mampc.program.daqp import DaqpSolver
 from mampc.program.qp import UNBOUNDED, QPStatus
 
@@ -92,3 +93,11 @@ def pytest_terminal_summary(terminalreporter):
     if FUZZED:
         ends = ", ".join(f"{count} {status}" for status, count in FUZZED.most_common())
         terminalreporter.write_line(f"{FUZZED.total()} fuzzed steps of the regulator: {ends}")
+
+
+@pytest.fixture(params=["kalman filter", "load bank"])
+def either_estimator(request, monkeypatch):
+    """Runs a test with each estimator as the default one of regulators."""
+    if request.param == "load bank":
+        monkeypatch.setattr("mampc.loop.regulator.default_estimator", load_bank)
+    return request.param

@@ -34,7 +34,7 @@ class Loop:
     rules: mampc.MoveRules | None
     method: str
     settings: dict[str, Any]
-    estimator: mampc.KalmanFilter
+    estimator: mampc.KalmanFilter | mampc.LoadBank
     sensors: mampc.SensorChecks
     max_blind_steps: int
 
@@ -78,7 +78,10 @@ def models(draw):
     assume(not integrating or m >= l)
     disturbance = "input" if integrating or (m >= l and draw(st.booleans())) else "output"
     try:
-        estimator = mampc.KalmanFilter.offset_free(model, disturbance=disturbance)
+        if draw(st.booleans()):
+            estimator = mampc.LoadBank(model, noise=scale * draw(st.sampled_from([1e-3, 0.1, 0.1, 10.0])))
+        else:
+            estimator = mampc.KalmanFilter.offset_free(model, disturbance=disturbance)
     except mampc.MampcError:
         assume(False)
     return model, estimator, scale

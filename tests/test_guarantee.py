@@ -9,6 +9,8 @@ import mampc
 from builders import random_model
 from referees import counted, keeps_dwell
 
+pytestmark = pytest.mark.usefixtures("either_estimator")
+
 STEPS = 30
 POLISHED = {name: {"polish": True, "warm_up": 0} if name == "alternating" else {} for name in mampc.METHODS}
 SIZES = st.one_of(st.just(0.0), st.floats(0.05, 1.0))

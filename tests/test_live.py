@@ -8,6 +8,8 @@ import mampc
 from builders import fading, identified_tank, predicted, random_model, tank_problem, violation_scale
 from mampc import Remark, Status
 
+EITHER = pytest.mark.usefixtures("either_estimator")
+
 METHODS = ["mpc", *mampc.METHODS]
 UPPER = mampc.Limits(u_min=0.0, u_max=100.0)
 
@@ -176,6 +178,7 @@ def test_a_plant_outside_its_output_limits_is_brought_back_and_the_violation_is_
     np.testing.assert_allclose(told[-1], 0.0, atol=1e-6)
 
 
+@EITHER
 @pytest.mark.parametrize(("low", "high"), [([40, 35], [45, 40]), ([36, 31], [41, 36])])
 @pytest.mark.parametrize(
     "rules",
@@ -216,6 +219,7 @@ def test_an_input_in_manual_stays_where_it_is_and_the_other_does_the_work(method
     np.testing.assert_array_equal(everything.plan, np.tile([40.0, 55.0], (5, 1)))
 
 
+@EITHER
 @pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=0.5, max_moves=3, sparsity_horizon=3)])
 def test_back_from_manual_there_is_no_bump(rules):
     """An operator takes the plant elsewhere and leaves it at rest there, at the reference."""
@@ -236,6 +240,7 @@ def test_back_from_manual_there_is_no_bump(rules):
             np.testing.assert_allclose(u, by_hand, atol=1e-3)
 
 
+@EITHER
 @pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=0.01)])
 @pytest.mark.parametrize("told", [None, mampc.Limits(u_max=60.0)])
 def test_an_input_held_outside_its_limits_by_hand_is_predicted_where_it_is(rules, told):
@@ -298,6 +303,7 @@ def test_the_way_back_inside_is_all_that_an_input_moves_by_where_moves_are_limit
     np.testing.assert_allclose(decision.plan[:, 0] - [-1.0, *decision.plan[:-1, 0]], decision.changes[:, 0])
 
 
+@EITHER
 def test_moves_made_by_hand_count_in_the_window():
     problem = tank_problem(identified_tank())
     rules = mampc.MoveRules(max_moves=2, sparsity_horizon=4)
@@ -309,6 +315,7 @@ def test_moves_made_by_hand_count_in_the_window():
     assert not decision.moves.any()
 
 
+@EITHER
 @pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=0.2)])
 @pytest.mark.parametrize("fault", ["saturated", "stuck", "late"])
 def test_what_the_actuators_really_did_is_told_and_leaves_no_offset(rules, fault):

@@ -5,7 +5,7 @@ import pytest
 
 import mampc
 
-CASES = [(seed, where) for seed in range(12) for where in ("input", "output")]
+CASES = [(seed, where, bank) for seed in range(12) for where in ("input", "output") for bank in (False, True)]
 
 
 def model_and_plant(seed):
@@ -28,9 +28,10 @@ def model_and_plant(seed):
     return model, plant
 
 
-def loop(model, plant, controller, where, size, steps=600):
+def loop(model, plant, controller, where, bank, size, steps=600):
     """Outputs of the plant with a step disturbance from sample 20 on, and the decisions."""
-    regulator = mampc.Regulator(controller, mampc.KalmanFilter.offset_free(model, disturbance=where))
+    kalman = mampc.KalmanFilter.offset_free(model, disturbance=where)
+    regulator = mampc.Regulator(controller, mampc.LoadBank(model, noise=0.1) if bank else kalman)
     disturbance = np.where(np.arange(steps)[:, None] >= 20, size, 0.0)
     run = mampc.simulate(
         plant, regulator, model.y_op, steps=steps, progress=False, **{f"{where}_disturbance": disturbance}
@@ -38,19 +39,21 @@ def loop(model, plant, controller, where, size, steps=600):
     return run.y, run.decisions
 
 
-@pytest.mark.parametrize(("seed", "where"), CASES)
-def test_mpc_removes_step_disturbances_though_the_model_is_wrong(seed, where):
+@pytest.mark.parametrize(("seed", "where", "bank"), CASES)
+def test_mpc_removes_step_disturbances_though_the_model_is_wrong(seed, where, bank):
     model, plant = model_and_plant(seed)
     problem = mampc.TrackingProblem(model, prediction_horizon=30, control_horizon=4, move_weight=1.0)
     size = np.array([1.0, -2.0])
-    y, decisions = loop(model, plant, mampc.MPC(problem), where, size)
+    y, decisions = loop(model, plant, mampc.MPC(problem), where, bank, size)
     assert {d.status.value for d in decisions} == {"optimal"}
     seen = np.abs(size if where == "output" else plant.dc_gain() @ size).max()
     assert np.abs(y[-1] - model.y_op).max() < 0.01 * seen
 
 
-@pytest.mark.parametrize(("seed", "where"), CASES)
-def test_with_a_price_what_stays_is_within_the_bound_of_the_price_though_the_model_is_wrong(seed, where):
+@pytest.mark.parametrize(("seed", "where", "bank"), CASES)
+def test_with_a_price_what_stays_is_within_the_bound_of_the_price_though_the_model_is_wrong(
+    seed, where, bank
+):
     model, plant = model_and_plant(seed)
     problem = mampc.TrackingProblem(
         model, prediction_horizon=30, control_horizon=4, move_weight=1.0, tail_horizon=2000.0
@@ -58,7 +61,7 @@ def test_with_a_price_what_stays_is_within_the_bound_of_the_price_though_the_mod
     rules = mampc.MoveRules(price=5.0)
     bound = mampc.largest_offset(problem, rules)
     assert np.isfinite(bound).all()
-    y, decisions = loop(model, plant, mampc.MAMPC(problem, rules), where, np.array([1.0, -2.0]))
+    y, decisions = loop(model, plant, mampc.MAMPC(problem, rules), where, bank, np.array([1.0, -2.0]))
     assert not any(d.moves[0].any() for d in decisions[-50:])
     assert (np.abs(y[-1] - model.y_op) <= bound * (1 + 1e-6)).all()
     assert (bound < 0.2).all()

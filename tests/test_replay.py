@@ -35,6 +35,7 @@ def tight_regulator(method):
     return mampc.Regulator(CONTROLLERS[method](tank_problem(model, limits=limits)))
 
 
+@pytest.mark.usefixtures("either_estimator")
 @pytest.mark.parametrize("method", CONTROLLERS)
 def test_a_state_kept_as_text_leads_to_the_same_decisions_to_the_bit(method):
     regulator = tight_regulator(method)
@@ -79,6 +80,7 @@ def test_a_text_that_is_no_state_of_this_regulator_is_refused(spoil, expected):
         regulator.state_from_json(spoil(content))
 
 
+@pytest.mark.usefixtures("either_estimator")
 @pytest.mark.parametrize("preview", [False, True])
 @pytest.mark.parametrize("method", CONTROLLERS)
 def test_a_simulated_run_replays_to_the_same_bits(method, preview):

@@ -7,6 +7,8 @@ import mampc
 from builders import identified_tank, random_model, tank_problem
 from mampc import Fault, Status
 
+pytestmark = pytest.mark.usefixtures("either_estimator")
+
 TANK = mampc.plants.QuadrupleTank()
 
 
@@ -69,7 +71,9 @@ def test_with_every_output_missing_the_inputs_are_held_after_max_blind_steps():
 
 
 @pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=1.0)])
-def test_the_first_good_sample_moves_the_inputs_no_further_than_every_day_operation_would(rules):
+def test_the_first_good_sample_moves_the_inputs_no_further_than_every_day_operation_would(
+    either_estimator, rules
+):
     """At rest, a blind spell and back: nothing happened meanwhile, so nothing is to be done."""
     regulator = tank_regulator(rules)
     model = regulator.controller.problem.model
@@ -87,7 +91,9 @@ def test_the_first_good_sample_moves_the_inputs_no_further_than_every_day_operat
     seen, *_ = plant_loop(
         regulator, 60, lambda k, y: y, noise=0.0, reference=model.y_op, at_output=lambda k: jump(k - 10)
     )
-    np.testing.assert_allclose(blind[50].u, seen[50].u, atol=1e-9)
+    if either_estimator == "kalman filter":
+        np.testing.assert_allclose(blind[50].u, seen[50].u, atol=1e-9)
+    assert (np.abs(blind[50].u - model.u_op) <= np.abs(seen[50].u - model.u_op) + 1e-9).all()
 
 
 @pytest.mark.parametrize("size", [20.0, -30.0, 1e5, 1e11])
@@ -119,7 +125,7 @@ def test_a_sensor_that_says_something_else_at_every_sample_is_never_believed():
     assert all(d.ignored_outputs == {"y1": Fault.JUMP} for d in decisions[30:])
 
 
-def test_a_stuck_sensor_does_not_drive_the_plant_away():
+def test_a_stuck_sensor_does_not_drive_the_plant_away(either_estimator):
     """It sticks below its reference: believed, it would have the plant pushed further and further."""
     stuck_from, seen = 40, {}
 
@@ -134,7 +140,7 @@ def test_a_stuck_sensor_does_not_drive_the_plant_away():
     found = next(k for k, d in enumerate(decisions) if d.ignored_outputs.get("y1") is Fault.STUCK)
     assert found < 100
     assert all(d.ignored_outputs == {"y1": Fault.STUCK} for d in decisions[found:160])
-    assert np.abs(outputs[40:] - reference).max() < 3.0
+    assert np.abs(outputs[40:] - reference).max() < (3.0 if either_estimator == "kalman filter" else 5.0)
     assert not any(d.ignored_outputs for d in decisions[162:])
     assert np.abs(outputs[-1] - reference).max() < 0.5
 
@@ -285,7 +291,7 @@ def test_a_sensor_is_found_stuck_once_and_its_stuck_run_is_no_healthy_one():
     """Also if nothing comes for a sample meanwhile, and whichever way the model moves the output."""
     sensors = mampc.SensorChecks(stuck_after=3, largest_jump=1.0).fitted(tank_problem(identified_tank()))
     none, moving = np.zeros(2), np.array([-0.5, 0.0])
-    state, found = sensors.initial(), []
+    state, found = sensors.initial(none), []
     healthy = 30.0 + np.random.default_rng(0).standard_normal(20)
     for shown in (*healthy, 31.03, 31.03, 31.03, 31.03, np.nan, 31.03, 31.03, 32.0):
         y = np.array([shown, 20.0 + len(found) / 7])

@@ -6,13 +6,15 @@ See README.md for ten lines that run, docs/ for the rest.
 from mampc import plants, rivals
 from mampc.base.errors import MampcError, StudyError
 from mampc.base.names import Names
-from mampc.base.words import Fault, Remark, Status
+from mampc.base.words import Fault, LoadKind, Remark, Status
 from mampc.controllers import MAMPC, MPC, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
 from mampc.identification import Export, Identified, IOData, Validation, excite, n4sid, read_export, validate
 from mampc.loop import loads
 from mampc.loop.batch import Batch, simulate_batch
 from mampc.loop.estimation import KalmanFilter
+from mampc.loop.hypotheses import Hypothesis
+from mampc.loop.load_bank import LoadBank
 from mampc.loop.metrics import Metrics
 from mampc.loop.regulator import Regulator
 from mampc.loop.replay import Difference, Recording, replay
@@ -56,10 +58,13 @@ __all__ = [
     "Fault",
     "Greedy",
     "HardThresholding",
+    "Hypothesis",
     "IOData",
     "Identified",
     "KalmanFilter",
     "Limits",
+    "LoadBank",
+    "LoadKind",
     "MampcError",
     "Metrics",
     "Mismatch",

@@ -67,3 +67,14 @@ class Fault(Sentence):
     OUT_OF_RANGE = "out_of_range", "The value is outside what the sensor can show."
     JUMP = "jump", "The value is too far from its prediction to be believed at once."
     STUCK = "stuck", "The value stays the same to the last bit although the output must have moved."
+
+
+class LoadKind(Sentence):
+    """What unmeasured loads seem to do; `load.sentence` says it in words."""
+
+    STEADY = "steady", "Loads hardly change."
+    WANDERS = "wanders", "Loads wander by about a third of the measurement noise a sample."
+    WANDERS_FAR = "wanders_far", "Loads wander by about the measurement noise a sample."
+    DIES_AWAY = "dies_away", "Loads come and die away by themselves within some ten samples."
+    DRIFTS = "drifts", "Loads go on in one direction for some thirty samples."
+    JUMPS = "jumps", "A load has just jumped."

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from mampc.program.daqp import active_bounds
 from mampc.program.limits_now import InputRange, LimitsNow, UsualLimits
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.sample import Indices, Sample
+from mampc.systems.state_space import StateSpace
 
 ROUNDED = 1e-12  # relative to an input: what sums of moves may be off by
 
@@ -38,7 +40,13 @@ class Controller(ABC):
         condensed: the condensed problem, where another controller has it already.
     """
 
+    _made_of: tuple[tuple[Any, ...], dict[str, Any]]
     starts_inside = False  # whether plans start from inputs inside their limits, or are to lead there
+
+    def __new__(cls, *arguments: Any, **settings: Any) -> Self:
+        made = super().__new__(cls)
+        made._made_of = arguments, settings
+        return made
 
     def __init__(
         self,
@@ -76,6 +84,17 @@ class Controller(ABC):
     def memory(self) -> int:
         """How many past inputs the controller looks back on."""
         return self._memory
+
+    def with_model(self, model: StateSpace) -> Self:
+        """The same controller, predicting with another model of the same signals."""
+
+        def on_model(argument: Any) -> Any:
+            if isinstance(argument, Controller):
+                return argument.with_model(model)
+            return replace(argument, model=model) if isinstance(argument, TrackingProblem) else argument
+
+        arguments, settings = self._made_of
+        return type(self)(*map(on_model, arguments), **{k: on_model(v) for k, v in settings.items()})
 
     def initial_state(self, u_previous: Any = None) -> ControllerState:
         """The state before the first sample.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
-from mampc.base.words import Fault, Remark, Status
+from mampc.base.words import Fault, LoadKind, Remark, Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +54,7 @@ class Decision(NamedTuple):
             ordinary numbers.
         ignored_outputs: outputs whose measurement was not believed at this sample, by name, and why; filled by
             `Regulator`.
+        load: what unmeasured loads seem to do, where the estimator asks; filled by `Regulator`.
     """
 
     u: Array
@@ -69,6 +70,7 @@ class Decision(NamedTuple):
     violations: Array
     resolution: Array
     ignored_outputs: Mapping[str, Fault] = {}
+    load: LoadKind | None = None
 
     @property
     def gap(self) -> float:

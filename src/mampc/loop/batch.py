@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -282,9 +282,10 @@ class _Loops:
         """The inputs after the measurements y (S, l), with the measured disturbances v (S, d)."""
         sensors, last, u = self._regulator._sensors, self._estimate, self._inputs[:, -1]
         told = v if self._has_v else self._v_last
-        estimate, innovation, _ = self._regulator.estimator.updates(last, u, y, self._v_last, told)
+        estimator = cast(KalmanFilter, self._regulator.estimator)
+        estimate, innovation, _ = estimator.updates(last, u, y, self._v_last, told)
         fine = sensors.are_fine(self._sensors, y, innovation)
-        after = sensors.after_fine(self._sensors, y, last.output_disturbance)
+        after = sensors.after_fine(self._sensors, y, estimator.loads_of(last))
         ahead = self._reference[k : k + (self._n_p or 0) + 1].swapaxes(0, 1).reshape(len(y), -1)
         place = self._regulator.controller.condensed.parameter
         parameters = np.ones((len(y), place.one.stop + ahead.shape[1]))

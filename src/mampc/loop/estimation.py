@@ -6,6 +6,7 @@ estimated with the state, remove steady offset under any constant model error or
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_vector, is_usable
 from mampc.base.errors import MampcError
+from mampc.base.words import LoadKind
 from mampc.loop.disturbances import Directions, alike, directions_of, response_within_reach
 from mampc.systems.riccati import predicted_covariance
 from mampc.systems.state_space import StateSpace
@@ -28,6 +30,11 @@ class Estimate:
     x: Array
     output_disturbance: Array
     input_disturbance: Array
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether all numbers are."""
+        return all(is_usable(part.ravel()) for part in vars(self).values())
 
 
 class Updated(NamedTuple):
@@ -44,7 +51,71 @@ class Updated(NamedTuple):
     movement: Array
 
 
-class KalmanFilter:
+class Estimator(ABC):
+    """What a `Regulator` needs of an estimator; all of it is pure.
+
+    Attributes:
+        model: the discrete model of the plant.
+    """
+
+    model: StateSpace
+
+    @property
+    def planning_model(self) -> StateSpace:
+        """The model whose states `Estimate.x` holds; by default that of the plant."""
+        return self.model
+
+    @abstractmethod
+    def initial(self, u: Array, y: Any = None, v: Array | None = None) -> Estimate:
+        """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
+        point; with measurements y (l,) the disturbances explain them.
+        """
+
+    @abstractmethod
+    def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
+        """Predict and correct with every output believed; None if some number is not usable.
+
+        Args:
+            last: the estimate at the last sample.
+            u: inputs applied since, shape (m,).
+            y: measurements, shape (l,), taken just before the inputs are replaced.
+            v_last, v: measured disturbances at the last sample and now, shape (d,).
+        """
+
+    @abstractmethod
+    def predict(self, last: Estimate, u: Array, v: Array | None = None) -> Estimate:
+        """One sample on, with the inputs u (m,) and disturbances v (d,) since."""
+
+    @abstractmethod
+    def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
+        """Measured less predicted outputs, shape (l,), for measurements taken as in `update`."""
+
+    @abstractmethod
+    def corrected(
+        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
+    ) -> Estimate:
+        """Correct with the innovation (l,), of which only the outputs `believed` count (default all)."""
+
+    @abstractmethod
+    def loads_of(self, estimate: Estimate) -> Array:
+        """What is estimated of loads, shape (k,), for the sensor checks to keep."""
+
+    @abstractmethod
+    def with_loads(self, estimate: Estimate, stuck: BoolArray, loads: Array) -> Estimate:
+        """The estimate without what measurements of stuck sensors made of the loads.
+
+        Args:
+            estimate: predicted.
+            stuck: which outputs, shape (l,), at least one.
+            loads: `loads_of` the estimate when the number that is stuck first came, shape (l, k).
+        """
+
+    def load(self, estimate: Estimate) -> LoadKind | None:
+        """What loads seem to do, in words; None for estimators that do not ask."""
+        return None
+
+
+class KalmanFilter(Estimator):
     """A stationary Kalman filter for a model augmented with integrating disturbances.
 
     Build it with `offset_free`. Outputs that are missing drop out of the correction: those that are left
@@ -179,14 +250,7 @@ class KalmanFilter:
         return self._disturbed(none, rest[:n], rest[n:])
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
-        """Predict and correct in one matrix product, with every output believed; None if some number is not usable.
-
-        Args:
-            last: the estimate at the last sample.
-            u: inputs applied since, shape (m,).
-            y: measurements, shape (l,), taken just before the inputs are replaced.
-            v_last, v: measured disturbances at the last sample and now, shape (d,).
-        """
+        """Predict and correct in one matrix product; see `Estimator`."""
         known = np.concatenate(
             (last.x, last.output_disturbance, last.input_disturbance, u, v_last, v, y, _ONE)
         )
@@ -261,6 +325,16 @@ class KalmanFilter:
         correction = gain @ innovation
         n = self.model.n_states
         return self._disturbed(predicted, predicted.x + correction[:n], correction[n:])
+
+    def loads_of(self, estimate: Estimate) -> Array:
+        """Disturbances at the outputs and inputs, shape (l + m,)."""
+        return np.concatenate((estimate.output_disturbance, estimate.input_disturbance), axis=-1)
+
+    def with_loads(self, estimate: Estimate, stuck: BoolArray, loads: Array) -> Estimate:
+        """The disturbances of stuck outputs are put back, and those of inputs with the first of them."""
+        l = len(stuck)
+        at_outputs = np.where(stuck, np.diag(loads[:, :l]), estimate.output_disturbance)
+        return Estimate(estimate.x, at_outputs, loads[int(stuck.argmax())][l:])
 
     def _disturbed(self, estimate: Estimate, x: Array, further: Array) -> Estimate:
         """The estimate with another state x, shape (n,), and further disturbances along the directions."""

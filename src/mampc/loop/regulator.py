@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import LARGEST, Array, as_shaped, as_vector, as_whole, is_usable
+from mampc.base.checks import LARGEST, Array, as_shaped, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.loop.actuators import LATEST, Actuators
-from mampc.loop.estimation import Estimate, KalmanFilter
+from mampc.loop.estimation import Estimate, Estimator, KalmanFilter
 from mampc.loop.sensors import Judged, SensorChecks, SensorState
 from mampc.loop.state import RegulatorState
 from mampc.program.daqp import active_flags
-from mampc.program.problem import Limits
+from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.state_space import StateSpace
 
 
@@ -26,7 +26,7 @@ class Regulator:
 
     Args:
         controller: `MPC` or `MAMPC`.
-        estimator: default `KalmanFilter.offset_free` of the controller's model.
+        estimator: default `KalmanFilter.offset_free` of the controller's model; or a `LoadBank`.
         sensors: when a measurement is believed; default `SensorChecks()`.
         max_blind_steps: samples in a row that inputs are still planned, on predictions, though no output at
             all is believed; from then on they are held until one is. 0 holds at once.
@@ -41,7 +41,7 @@ class Regulator:
     def __init__(
         self,
         controller: Controller,
-        estimator: KalmanFilter | None = None,
+        estimator: Estimator | None = None,
         *,
         sensors: SensorChecks | None = None,
         max_blind_steps: int = 0,
@@ -49,15 +49,17 @@ class Regulator:
     ) -> None:
         if not isinstance(controller, Controller):
             raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
-        if not isinstance(estimator, KalmanFilter | None):
-            raise MampcError(f"estimator: expected a KalmanFilter, received {type(estimator).__name__}")
+        if not isinstance(estimator, Estimator | None):
+            raise MampcError(
+                f"estimator: expected a KalmanFilter or a LoadBank, received {type(estimator).__name__}"
+            )
         if not isinstance(sensors, SensorChecks | None):
             raise MampcError(f"sensors: expected SensorChecks, received {type(sensors).__name__}")
         model = controller.problem.model
         self.controller = controller
         self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
         self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
-        self.estimator = KalmanFilter.offset_free(model) if estimator is None else estimator
+        self.estimator = default_estimator(controller.problem) if estimator is None else estimator
         self._sensors = (SensorChecks() if sensors is None else sensors).fitted(controller.problem)
         self._v_shape = (model.n_disturbances,)
         tolerance = None
@@ -69,6 +71,10 @@ class Regulator:
         expected, received = _sizes(model), _sizes(self.estimator.model)
         if received != expected:
             raise MampcError(f"estimator: expected a model with {expected}, received {received}")
+        # What plans predict with may have more states than the plant.
+        self._planner = controller
+        if self.estimator.planning_model is not self.estimator.model:
+            self._planner = controller.with_model(self.estimator.planning_model)
 
     def __repr__(self) -> str:
         return f"Regulator({type(self.controller).__name__}, {self.estimator!r})"
@@ -93,7 +99,8 @@ class Regulator:
             v = as_vector("measured_disturbance", measured_disturbance, len(v))
         estimate = self.estimator.initial(controller.inputs[-1], y, v)
         actuators = self._actuators.initial(controller.inputs)
-        return RegulatorState(controller, estimate, v, self._sensors.initial(), actuators)
+        sensors = self._sensors.initial(self.estimator.loads_of(estimate))
+        return RegulatorState(controller, estimate, v, sensors, actuators)
 
     def state_from_json(self, text: str) -> RegulatorState:
         """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
@@ -102,12 +109,20 @@ class Regulator:
             "controller.guess": (problem.control_horizon, problem.model.n_inputs),
             "controller.active": (self.controller.condensed.bounds.size,),
         }
+        if type(state.estimate) is not type(self.initial_state().estimate):
+            raise MampcError(
+                f"state: expected an estimate of {type(self.estimator).__name__}, received another estimator's"
+            )
         for place, shape in state.shapes().items():
             if place == "controller.memory":  # what a rule around a controller keeps; it knows what fits
                 continue
             may_be_none = place in ("controller.guess", "controller.active")
             if shape != expected[place] and not (may_be_none and shape is None):
                 raise MampcError(f"state: expected {place} of shape {expected[place]}, received {shape}")
+        for name in ("weights", "usual"):
+            shares = getattr(state.estimate, name, np.ones(1))
+            if (shares < 0).any() or not abs(shares.sum() - 1) < 1e-9:
+                raise MampcError(f"state: expected estimate.{name} that sum up to 1, received {shares}")
         if not active_flags(state.controller.active):
             raise MampcError(
                 f"state: expected flags at controller.active, received {state.controller.active}"
@@ -169,7 +184,7 @@ class Regulator:
             v = _where_usable(as_shaped("measured_disturbance", measured_disturbance, self._v_shape), v_last)
         estimate, judged, sensors = self._estimate(state, u_previous, y, v)
         blind = sensors.blind > self.max_blind_steps
-        decision = self.controller.step(
+        decision = self._planner.step(
             memory,
             np.full_like(estimate.x, np.nan) if blind else estimate.x,  # not-a-number: hold
             reference,
@@ -182,6 +197,7 @@ class Regulator:
         return decision._replace(
             state=RegulatorState(decision.state, estimate, v, sensors, actuators.decided(decision.u)),
             ignored_outputs=judged.faults,
+            load=self.estimator.load(estimate),
             solve_time=perf_counter() - start,
         )
 
@@ -197,27 +213,32 @@ class Regulator:
             v: measured disturbances now, shape (d,); outputs show them at once, and inputs u later.
         """
         estimator, last, v_last = self.estimator, state.estimate, state.measured_disturbance
-        known = last.output_disturbance
+        loads = estimator.loads_of(last)
         updated = estimator.update(last, u, y, v_last, v)
         if updated is not None:
             judged, sensors = self._sensors.update(
-                state.sensors, y, updated.innovation, updated.movement, known
+                state.sensors, y, updated.innovation, updated.movement, loads
             )
             if not judged.faults:  # the everyday case
                 return updated.estimate, judged, sensors
         estimate = estimator.predict(last, u, v_last)
-        if not all(map(is_usable, (estimate.x, estimate.output_disturbance, estimate.input_disturbance))):
+        if not estimate.is_usable:
             # It ran away without measurements: start again.
             last = estimate = estimator.initial(u, None, v_last)
         innovation = estimator.innovation(estimate, u, y, v)
-        movement = estimator.model.C @ (estimate.x - last.x)
-        judged, sensors = self._sensors.update(state.sensors, y, innovation, movement, known)
+        C = estimator.model.C
+        movement = C @ (estimate.x - last.x)[: C.shape[1]]
+        judged, sensors = self._sensors.update(state.sensors, y, innovation, movement, loads)
         if judged.newly_stuck.any():
-            disturbance = np.where(judged.newly_stuck, sensors.disturbance, estimate.output_disturbance)
-            estimate = replace(estimate, output_disturbance=disturbance)
+            estimate = estimator.with_loads(estimate, judged.newly_stuck, sensors.loads)
         if judged.believed.any():
             estimate = estimator.corrected(estimate, innovation, judged.believed)
         return estimate, judged, sensors
+
+
+def default_estimator(problem: TrackingProblem) -> Estimator:
+    """What a regulator estimates with unless told otherwise."""
+    return KalmanFilter.offset_free(problem.model)
 
 
 def _where_usable(told: Array, otherwise: Array) -> Array:

@@ -36,7 +36,7 @@ class Recording:
         v: measured disturbances, shape (T, d).
         u: decided inputs, shape (T, m).
         objective: of each decision, shape (T,), not-a-number where inputs were held.
-        status, remarks, ignored: of each decision, as text.
+        status, remarks, ignored, load: of each decision, as text.
         names: of the signals.
     """
 
@@ -49,6 +49,7 @@ class Recording:
     status: tuple[str, ...]
     remarks: tuple[str, ...]
     ignored: tuple[str, ...]
+    load: tuple[str, ...]
     names: Names
 
     @classmethod
@@ -57,8 +58,12 @@ class Recording:
         objective = np.array([decision.objective for decision in run.decisions])
         status = tuple(decision.status.value for decision in run.decisions)
         said = [told(decision) for decision in run.decisions]
-        remarks, ignored = (tuple(words[kind] for words in said) for kind in ("remarks", "ignored"))
-        return cls(run.t, run.y_measured, run.r, run.v, run.u, objective, status, remarks, ignored, run.names)
+        remarks, ignored, load = (
+            tuple(words[kind] for words in said) for kind in ("remarks", "ignored", "load")
+        )
+        return cls(
+            run.t, run.y_measured, run.r, run.v, run.u, objective, status, remarks, ignored, load, run.names
+        )
 
     @classmethod
     def from_csv(cls, path: str | Path, names: Names) -> Recording:
@@ -79,6 +84,7 @@ class Recording:
             tuple(table.words("status")),
             tuple(table.words("remarks")),
             tuple(table.words("ignored")),
+            tuple(table.words("load")),
             names,
         )
 
@@ -142,6 +148,7 @@ def replay(
             ("the status", recording.status[k], decision.status.value),
             ("the remarks", recording.remarks[k], told(decision)["remarks"]),
             ("the ignored outputs", recording.ignored[k], told(decision)["ignored"]),
+            ("the load", recording.load[k], told(decision)["load"]),
         ):
             if said != says:
                 return Difference(k, t, name, said or "none", says or "none")

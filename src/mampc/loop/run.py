@@ -105,8 +105,8 @@ class Run:
         return signals_figure({"closed loop": self}, look={"closed loop": Look(BLUE)}, limits=limits)
 
     def to_csv(self, path: str | Path) -> None:
-        """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs, in
-        full precision; and where the actuators were, if not where they were told to.
+        """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs and
+        what loads seem to do, in full precision; and where the actuators were, if not where they were told to.
         """
         if len(self.decisions) != len(self.t):
             raise MampcError(
@@ -117,6 +117,7 @@ class Run:
             "time", *inputs, *self.names.disturbances, *outputs,
             *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
             "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored",
+            "load",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
         positions: list[list[float]] = [[] for _ in self.t]
@@ -136,4 +137,5 @@ class Run:
 def told(decision: Decision) -> dict[str, str]:
     """What a decision says beside its numbers and its status, by column of a file."""
     ignored = " ".join(f"{y}:{fault}" for y, fault in decision.ignored_outputs.items())
-    return {"remarks": " ".join(decision.remarks), "ignored": ignored}
+    load = "" if decision.load is None else str(decision.load)
+    return {"remarks": " ".join(decision.remarks), "ignored": ignored, "load": load}

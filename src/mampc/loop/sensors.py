@@ -107,7 +107,7 @@ class SensorState:
         moved: how far the model moved the output meanwhile.
         stuck: 1 where the sensor counts as stuck, else 0.
         doubted: how many samples in a row jumped to about the same place.
-        disturbance: estimated at the output when its present number first came.
+        loads: what the estimator had found of loads when the present number of each output first came, shape (l, k).
         longest: run of equal numbers, in samples, that ended with a change although the model moved the output.
         step: that all its changes were multiples of, as long as it is not small; 0 before the first.
         blind: samples in a row without any output believed.
@@ -118,7 +118,7 @@ class SensorState:
     moved: Array
     stuck: Array
     doubted: Array
-    disturbance: Array
+    loads: Array
     longest: Array
     step: Array
     blind: int = 0
@@ -167,12 +167,13 @@ class Sensors:
         self._all, self._none, self._zeros = np.ones(l, dtype=bool), np.zeros(l, dtype=bool), np.zeros(l)
         self._fine = Judged(self._all, {}, self._none)
 
-    def initial(self) -> SensorState:
-        """Before the first sample."""
-        return SensorState(*(self._zeros,) * 8)
+    def initial(self, loads: Array) -> SensorState:
+        """Before the first sample, with `loads` as in `update`."""
+        zeros = self._zeros
+        return SensorState(zeros, zeros, zeros, zeros, zeros, self._each(loads), zeros, zeros)
 
     def update(
-        self, state: SensorState, y: Array, innovation: Array, movement: Array, disturbance: Array
+        self, state: SensorState, y: Array, innovation: Array, movement: Array, loads: Array
     ) -> tuple[Judged, SensorState]:
         """Judge one sample.
 
@@ -181,10 +182,10 @@ class Sensors:
             y: measurements, shape (l,), finite or not.
             innovation: measured less predicted outputs, shape (l,).
             movement: how far the model moved the outputs since the last sample, shape (l,).
-            disturbance: estimated at the outputs before this sample, shape (l,).
+            loads: what the estimator has found of them before this sample, shape (k,).
         """
         if self._is_fine(state, y, innovation):  # the everyday case, at once
-            return self._fine, self.after_fine(state, y, disturbance)
+            return self._fine, self.after_fine(state, y, loads)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))
         came = ~(missing | out)
@@ -202,7 +203,7 @@ class Sensors:
             np.where(came, y, state.y), repeats, moved,
             np.where(came, stuck, state.stuck).astype(np.float64),
             np.where(came, doubted, state.doubted),
-            np.where(changed, disturbance, state.disturbance),
+            np.where(changed[:, None], loads, state.loads),
             self._longest(state, changed), self._step(state, y, changed),
             0 if believed.any() else state.blind + 1,
         )  # fmt: skip
@@ -228,11 +229,15 @@ class Sensors:
         fine: BoolArray = np.asarray(near.all(axis=1))
         return fine
 
-    def after_fine(self, state: SensorState, y: Array, disturbance: Array) -> SensorState:
+    def after_fine(self, state: SensorState, y: Array, loads: Array) -> SensorState:
         """The next state where all outputs were fine, of one loop or of many."""
         zeros = self._zeros if y.ndim == 1 else np.zeros_like(y)
         step, longest = self._step(state, y, self._all), self._longest(state, self._all)
-        return SensorState(y.copy(), zeros, zeros, zeros, zeros, disturbance, longest, step)
+        return SensorState(y.copy(), zeros, zeros, zeros, zeros, self._each(loads), longest, step)
+
+    def _each(self, loads: Array) -> Array:
+        """The loads (k,) once for every output, shape (l, k), of one loop or of many."""
+        return loads[..., None, :].repeat(len(self._zeros), axis=-2)
 
     def _is_stuck(self, state: SensorState, repeats: Array, moved: Array) -> BoolArray:
         """The outputs that have shown the same for too long, though the model moved them, shape (l,)."""

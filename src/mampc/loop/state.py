@@ -13,6 +13,7 @@ from mampc.base.errors import MampcError, shown
 from mampc.controllers.decision import ControllerState
 from mampc.loop.actuators import ActuatorState
 from mampc.loop.estimation import Estimate
+from mampc.loop.load_bank import BankEstimate
 from mampc.loop.sensors import SensorState
 
 FORMAT = "mampc-regulator-state-1"
@@ -48,11 +49,12 @@ class RegulatorState:
             if content.pop("format") != FORMAT:
                 raise MampcError(f"state: expected the format {FORMAT!r}")
             numbers = {part: _numbers(part, values) for part, values in content.items()}
-            actuators = numbers.pop("actuators")
+            actuators, sensors, estimate = (numbers.pop(p) for p in ("actuators", "sensors", "estimate"))
+            kind = BankEstimate if "weights" in estimate else Estimate
             return cls(
                 ControllerState(**numbers.pop("controller")),
-                Estimate(**numbers.pop("estimate")),
-                sensors=SensorState(**numbers.pop("sensors")),
+                kind(**estimate),
+                sensors=SensorState(**sensors),
                 actuators=ActuatorState(tuple(actuators.pop("commands")), **actuators),
                 **numbers,
             )

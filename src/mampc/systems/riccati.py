@@ -2,22 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 
 _ROUNDS = 60  # each doubles the number of samples seen
+_SETTLED = 1e-10  # what one more doubling may still add, as a share of what is there
 
 
 def predicted_covariance(A: Array, C: Array, Q: Array, R: Array) -> Array:
     """P = A (P - P C' (C P C' + R)^-1 C P) A' + Q, positive semidefinite, shape (n, n).
 
-    Source: Chu, Fan, Lin and Wang, Int. J. Control 77 (2004): structure-preserving doubling, which converges
-    quadratically.
-
     Raises:
         MampcError: no such solution is found: a mode that does not decay is not seen, or never disturbed.
+    """
+    for P, more in _doubled(A, C, Q, R):
+        if (np.abs(np.diag(more)) <= 1e-13 * np.diag(P)).all():
+            return P
+    raise MampcError("expected a detectable model whose modes are all disturbed, the Riccati equation failed")
+
+
+def seen_covariance(A: Array, C: Array, Q: Array, R: Array) -> Array:
+    """P after so many samples, from P = Q, that what outputs show of it has settled, shape (n, n).
+
+    Where all is detectable this is `predicted_covariance`. Elsewhere, as with loads at inputs and outputs that
+    cannot be told apart, P grows without bound along what no output ever shows, and only there.
+
+    Raises:
+        MampcError: it does not settle: a mode that grows is not seen, or never disturbed.
+    """
+    for P, more in _doubled(A, C, Q, R):
+        size = np.sqrt(np.outer(np.diag(C @ P @ C.T) + np.diag(R), np.diag(P)))
+        if (np.abs(C @ more) <= _SETTLED * size).all():
+            return P
+    raise MampcError("expected a model whose modes are all seen and disturbed, the Riccati equation failed")
+
+
+def _doubled(A: Array, C: Array, Q: Array, R: Array) -> Iterator[tuple[Array, Array]]:
+    """P after 2, 4, 8, ... samples, and by how much it grew, until numbers overflow.
+
+    Source: Chu, Fan, Lin and Wang, Int. J. Control 77 (2004): structure-preserving doubling, which converges
+    quadratically.
     """
     I = np.eye(len(A))
     F, G, P = A.T, C.T @ np.linalg.solve(R, C), Q
@@ -26,12 +54,10 @@ def predicted_covariance(A: Array, C: Array, Q: Array, R: Array) -> Array:
             try:
                 solved = np.linalg.solve(I + G @ P, np.hstack([F, G]))
             except np.linalg.LinAlgError:
-                break
+                return
             W, V = solved[:, : len(A)], solved[:, len(A) :]
             more_P, more_G = F.T @ P @ W, F @ V @ F.T
             P, G, F = P + (more_P + more_P.T) / 2, G + (more_G + more_G.T) / 2, F @ W
             if not np.isfinite(P).all():
-                break
-            if (np.abs(np.diag(more_P)) <= 1e-13 * np.diag(P)).all():
-                return P
-    raise MampcError("expected a detectable model whose modes are all disturbed, the Riccati equation failed")
+                return
+            yield P, more_P

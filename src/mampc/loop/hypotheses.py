@@ -1,0 +1,183 @@
+"""Hypotheses about the load, each as a model with states, and the Kalman filter that it asks for.
+
+A load acts at every input, and at every output that no slow or integrating mode moves (there it can hardly be told
+from one at the inputs). It is w now and will be w + s, w + s + a s, ... at the next samples: each hypothesis says how
+w and s are driven by noise, per sample and in loads that show in the outputs like their measurement noise:
+
+    z = (x, w, s)      w+ = w + s + walk xi + burst eta      s+ = a s + slope zeta - (1 - a) burst eta
+
+so that a burst dies away by itself, and a slope goes on for a while. The long-term load w + s / (1 - a) is constant:
+whatever hypothesis holds leaves no offset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray
+from mampc.base.errors import MampcError
+from mampc.base.words import LoadKind
+from mampc.loop.disturbances import directions_of, response_within_reach
+from mampc.systems.riccati import seen_covariance
+from mampc.systems.state_space import StateSpace
+
+INPUT_NOISE = 0.1  # white noise at every input, which shows in the outputs as this share of their noise
+RUNS_AWAY = 1e-5  # how much faster than the plant the error of an estimate may grow per sample, for rounding
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One way that loads behave; see the module for the symbols.
+
+    Attributes:
+        load: what is said where it holds.
+        walk, burst, slope: standard deviations per sample, in loads that show in the outputs like their noise.
+        kept: a, the share of s that the next sample keeps; 0 for loads without s.
+    """
+
+    load: LoadKind
+    walk: float
+    burst: float = 0.0
+    slope: float = 0.0
+    kept: float = 0.0
+
+
+HYPOTHESES = (
+    Hypothesis(LoadKind.STEADY, walk=0.1),
+    Hypothesis(LoadKind.WANDERS, walk=0.3),
+    Hypothesis(LoadKind.WANDERS_FAR, walk=1.0),
+    Hypothesis(LoadKind.DIES_AWAY, walk=0.1, burst=1.0, kept=0.9),
+    Hypothesis(LoadKind.DRIFTS, walk=0.1, slope=0.05, kept=0.97),
+    Hypothesis(LoadKind.JUMPS, walk=5.0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Loads:
+    """Where the k loads of a model act, each of a size that shows in the outputs like their noise.
+
+    Attributes:
+        model: of the plant.
+        noise: standard deviation of the measurement noise, shape (l,), in output units.
+        at_inputs, at_outputs: shapes (m, k) and (l, k).
+    """
+
+    model: StateSpace
+    noise: Array
+    at_inputs: Array
+    at_outputs: Array
+
+    @classmethod
+    def of(cls, model: StateSpace, noise: Array) -> Loads:
+        m, l = model.n_inputs, model.n_outputs
+        reach = response_within_reach(model)
+        effect = np.linalg.norm(reach / noise[:, None], axis=0) / np.sqrt(l)
+        effective = effect > 0
+        unit = np.where(effective, 1 / np.where(effective, effect, 1.0), 0.0)
+        outputs = directions_of(model, "auto", reach, noise, unit).at_outputs
+        outputs = outputs[:, outputs.any(axis=0)]
+        inputs = np.diag(unit)[:, effective]
+        return cls(
+            model, noise,
+            np.hstack([inputs, np.zeros((m, outputs.shape[1]))]),
+            np.hstack([np.zeros((l, inputs.shape[1])), outputs]),
+        )  # fmt: skip
+
+    @property
+    def count(self) -> int:
+        """k."""
+        return len(self.at_inputs.T)
+
+    @property
+    def on_states(self) -> Array:
+        """What a load adds to the next state, shape (n, k)."""
+        return self.model.B[:, : self.model.n_inputs] @ self.at_inputs
+
+    @property
+    def on_outputs(self) -> Array:
+        """What a load adds to the outputs at once, shape (l, k)."""
+        return self.at_outputs + self.model.D[:, : self.model.n_inputs] @ self.at_inputs
+
+    def with_fading(self, kept: tuple[float, ...]) -> StateSpace:
+        """The model with loads that fade as further states, k for every share that a sample keeps."""
+        model, count, fading = self.model, len(kept), np.repeat(kept, self.count)
+        n, columns = model.n_states, model.B.shape[1]
+        return replace(
+            model,
+            A=np.block(
+                [
+                    [model.A, np.tile(self.on_states, count)],
+                    [np.zeros((len(fading), n)), np.diag(fading)],
+                ]
+            ),
+            B=np.vstack([model.B, np.zeros((len(fading), columns))]),
+            C=np.hstack([model.C, np.tile(self.on_outputs, count)]),
+            names=replace(model.names, states=()),
+        )
+
+
+class Member:
+    """The stationary Kalman filter of one hypothesis, state z = (x, w, s), in engineering units.
+
+    Attributes:
+        hypothesis: which.
+        A, C: of z, shapes (n + 2k, n + 2k) and (l, n + 2k).
+        covariance: of z before a measurement; what no output will ever show may be as good as unbounded.
+        noise: covariance of the measurement noise, shape (l, l).
+    """
+
+    def __init__(self, hypothesis: Hypothesis, loads: Loads) -> None:
+        self.hypothesis = hypothesis
+        model, k, a = loads.model, loads.count, hypothesis.kept
+        n, l, none, same = model.n_states, model.n_outputs, np.zeros((loads.count, loads.count)), np.eye(k)
+        self.A = np.block(
+            [
+                [model.A, loads.on_states, np.zeros((n, k))],
+                [np.zeros((k, n)), same, same if a > 0 else none],
+                [np.zeros((k, n)), none, a * same],
+            ]
+        )
+        self.C = np.hstack([model.C, loads.on_outputs, np.zeros((l, k))])
+        driven = INPUT_NOISE * loads.on_states
+        burst, fall = hypothesis.burst**2, -(1 - a) * hypothesis.burst**2
+        Q = np.zeros_like(self.A)
+        Q[:n, :n] = driven @ driven.T + 1e-10 * np.trace(driven @ driven.T) * np.eye(n)
+        Q[n:, n:] = np.kron(
+            [[hypothesis.walk**2 + burst, fall], [fall, hypothesis.slope**2 - (1 - a) * fall]], same
+        )
+        # In units of the noise, so that numbers of all outputs are alike.
+        self.noise = np.diag(loads.noise**2)
+        self.covariance = seen_covariance(self.A, self.C / loads.noise[:, None], Q, np.eye(l))
+        self._fastest = max(1.0, float(np.abs(model.poles()).max(initial=0.0)))
+        if not self._growth(self.gain(np.ones(l, dtype=bool))) <= 1 + RUNS_AWAY:
+            raise MampcError("expected a model whose growing modes are all seen in its outputs")
+
+    def gain(self, believed: BoolArray) -> Array:
+        """From innovation to z, shape (n + 2k, l), with zero columns for outputs that are not believed.
+
+        Should the rest be too little to keep the estimate from running away, nothing is corrected.
+        """
+        C, P = self.C[believed], self.covariance
+        gain = np.zeros((len(P), len(believed)))
+        if believed.any():
+            gain[:, believed] = np.linalg.solve(self.innovation_covariance(believed), C @ P).T
+        return gain if self._growth(gain) <= self._fastest + RUNS_AWAY else np.zeros_like(gain)
+
+    def _growth(self, gain: Array) -> float:
+        """By what the error of the estimate grows from sample to sample, in the end, with a gain."""
+        return float(np.abs(np.linalg.eigvals(self.A - gain @ self.C @ self.A)).max())
+
+    def innovation_covariance(self, believed: BoolArray) -> Array:
+        """Of the outputs believed, a square matrix."""
+        C = self.C[believed]
+        covariance: Array = C @ self.covariance @ C.T + self.noise[np.ix_(believed, believed)]
+        return (covariance + covariance.T) / 2
+
+    @property
+    def posterior(self) -> Array:
+        """Covariance of z after a measurement of all outputs, shape (n + 2k, n + 2k)."""
+        everything = np.ones(len(self.noise), dtype=bool)
+        posterior: Array = self.covariance - self.gain(everything) @ self.C @ self.covariance
+        return (posterior + posterior.T) / 2

@@ -1,0 +1,358 @@
+"""An estimator with several hypotheses about the load, mixed by how likely the measurements make them.
+
+Each hypothesis has its Kalman filter with a fixed gain. Their weights mu follow Bayes' rule, with a small chance T that
+the load begins to behave in another way from one sample to the next; at each sample the filters start from the
+mixture of all that may have led to them:
+
+    c_b = sum_a mu_a T_ab      z_b <- sum_a mu_a T_ab z_a / c_b      mu_b ~ c_b N(e_b; 0, S_b)
+
+with the innovation e_b of filter b and its covariance S_b.
+
+Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
+stationary gains, and with jumps that give way to what held before them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray, as_vector, is_usable
+from mampc.base.errors import MampcError
+from mampc.base.words import LoadKind
+from mampc.loop.estimation import Estimate, Estimator, Updated
+from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
+from mampc.program.problem import TrackingProblem
+from mampc.systems.state_space import StateSpace
+
+STAYS = 0.998  # chance that a load goes on as it does
+TO_JUMP = 0.001  # chance that it jumps; what is left goes to the other hypotheses
+JUMP_GOES_ON = 0.3  # chance that a jump takes one more sample
+FORGETS = 0.01  # share by which a sample counts in what usually holds
+LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
+NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
+
+SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
+
+_ONE = np.ones(1)
+
+
+@dataclass(frozen=True, eq=False)
+class BankEstimate(Estimate):
+    """What every hypothesis estimates, and their mixture.
+
+    Attributes:
+        x: states of `planning_model`: those of the plant, and loads that fade.
+        output_disturbance, input_disturbance: lasting ones, shapes (l,) and (m,).
+        members: z of each hypothesis, shape (B, n + 2k).
+        weights: how likely each hypothesis is, shape (B,), with sum 1.
+        usual: how likely each one is on average of the samples without jumps, shape (B,), with sum 1.
+    """
+
+    members: Array
+    weights: Array
+    usual: Array
+
+
+class Filters(NamedTuple):
+    """The gains of all hypotheses where some outputs are believed, and what measures their innovations.
+
+    Attributes:
+        gains: shape (B, n + 2k, l).
+        whiten: W with |W e|^2 = e' S^-1 e, shape (B, l, l).
+        log_scale: -1/2 log det S, shape (B,).
+    """
+
+    gains: Array
+    whiten: Array
+    log_scale: Array
+
+
+class LoadBank(Estimator):
+    """An estimator that finds out how unmeasured loads behave; see the module.
+
+    `Estimate.x` holds the states of `planning_model`: loads may fade, and plans count on it.
+
+    Args:
+        model: a discrete model.
+        noise: standard deviation of the measurement noise of each output, scalar or (l,), in output units. Twice
+            too large, loads are found later; twice too small, noise is taken for loads. Default: `model.noise`,
+            where the model knows it; see `for_problem` for a guess.
+        hypotheses: about the load, at least one; see `HYPOTHESES`.
+
+    Raises:
+        MampcError: a continuous model, no noise, or a mode that grows and is not seen in the outputs.
+    """
+
+    def __init__(
+        self, model: StateSpace, *, noise: Any = None, hypotheses: tuple[Hypothesis, ...] = HYPOTHESES
+    ) -> None:
+        if not isinstance(model, StateSpace):
+            raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
+        if not model.is_discrete:
+            raise MampcError("LoadBank: expected a discrete model, received dt = 0; discretise it first")
+        if not hypotheses or not all(isinstance(h, Hypothesis) for h in hypotheses):
+            raise MampcError("hypotheses: expected at least one Hypothesis")
+        noise = getattr(model, "noise", None) if noise is None else noise
+        if noise is None:
+            raise MampcError(
+                "noise: expected the standard deviation of each output's measurement noise, received none; "
+                "give it, or let LoadBank.for_problem guess"
+            )
+        sizes = as_vector("noise", noise, model.n_outputs)
+        if (sizes <= 0).any():
+            raise MampcError(f"noise: expected positive numbers, received {sizes}")
+        self.model, self.noise, self.hypotheses = model, sizes, tuple(hypotheses)
+        self.loads = Loads.of(model, sizes)
+        try:
+            self.members = [Member(hypothesis, self.loads) for hypothesis in self.hypotheses]
+        except MampcError as error:
+            raise MampcError(f"LoadBank: {error}") from None
+        self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
+        self._planning_model = self.loads.with_fading(self._kept) if self._kept else model
+        self._jumps = np.array([h.load is LoadKind.JUMPS for h in self.hypotheses])
+        self._lasts = np.where(self._jumps & ~self._jumps.all(), 0.0, 1.0)
+        self._ones = np.ones(len(self.hypotheses))
+        self._chances, self._returns = _chances(self._jumps)
+        self._A = np.stack([member.A for member in self.members])
+        self._C = np.stack([member.C for member in self.members])
+        self._plans = np.stack([self.to_plan(b) for b in range(len(self.members))])
+        self._mixture = np.vstack([plan.T for plan in self._plans])
+        self._filters: dict[bytes, Filters] = {}
+        self._all = np.ones(model.n_outputs, dtype=bool)
+        self._of_states, self._of_known = self._everyday()
+        size = self._of_known.shape[0] * self._of_states.shape[0] * self._of_states.shape[2]
+        self._together = None if size > SMALL else np.hstack([_diagonal(self._of_states), self._of_known])
+
+    @classmethod
+    def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
+        """A bank for the model of a problem, whose limits give a guess of the noise where nobody tells it.
+
+        The guess is a 500th of what the whole range of the inputs does to an output within 20 samples.
+
+        Raises:
+            MampcError: as for `LoadBank`; and inputs without limits where the noise has to be guessed.
+        """
+        model, limits = problem.model, problem.limits
+        if noise is None and getattr(model, "noise", None) is None:
+            response = np.abs(model.step_response(21)[:, :, : model.n_inputs]).max(axis=0)
+            moved = response > 0
+            reach = np.where(moved, response, 0.0) @ np.where(
+                moved.any(axis=0), limits.u_max - limits.u_min, 0.0
+            )
+            if not (np.isfinite(reach) & (reach > 0)).all():
+                raise MampcError("noise: expected standard deviations, since inputs without limits tell none")
+            noise = NOISE_OF_REACH * reach
+        return cls(model, noise=noise)
+
+    def __repr__(self) -> str:
+        words = " ".join(h.load.value for h in self.hypotheses)
+        return f"LoadBank({self.model!r}, {self.loads.count} loads, hypotheses {words})"
+
+    @property
+    def planning_model(self) -> StateSpace:
+        """The model that plans predict with: that of the plant, with loads that fade as further states."""
+        return self._planning_model
+
+    def to_plan(self, b: int) -> Array:
+        """From z of hypothesis b to the (x, d_u, d_y) of plans, shape (states of `planning_model` + m + l, n + 2k)."""
+        loads, kept = self.loads, self.hypotheses[b].kept
+        k, n, nz = loads.count, self.model.n_states, self.members[b].A.shape[0]
+        z = np.eye(nz)
+        x, w, s = z[:n], z[n : n + k], z[n + k :]
+        lasting = w if kept == 0 else w + s / (1 - kept)
+        fading = [-s / (1 - kept) if a == kept else 0 * s for a in self._kept]
+        return np.vstack([x, *fading, loads.at_inputs @ lasting, loads.at_outputs @ lasting])
+
+    def load(self, estimate: Estimate) -> LoadKind:
+        """The hypothesis that is the most likely one, in words."""
+        return self.hypotheses[int(_bank(estimate).weights.argmax())].load
+
+    def loads_of(self, estimate: Estimate) -> Array:
+        """The loads of the mixture, shape (k,), in sizes that show in the outputs like their noise."""
+        bank, n = _bank(estimate), self.model.n_states
+        loads: Array = (bank.weights @ bank.members)[n : n + self.loads.count]
+        return loads
+
+    def with_loads(self, estimate: Estimate, stuck: BoolArray, loads: Array) -> Estimate:
+        """The estimate with the loads (k,) of before the outputs `stuck` (l,) were; see `Estimator`."""
+        bank, n = _bank(estimate), self.model.n_states
+        members = bank.members.copy()
+        members[:, n : n + self.loads.count] = loads[int(stuck.argmax())]
+        members[:, n + self.loads.count :] = 0.0
+        return self._estimate(members, bank.weights, bank.usual)
+
+    def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
+        """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
+        point; with measurements y (l,) the loads explain them, as small as they can.
+        """
+        model, loads = self.model, self.loads
+        n, k = model.n_states, loads.count
+        all_inputs = np.concatenate([u, model.v_op if v is None else v])
+        change, w = all_inputs - model.all_inputs_op, np.zeros(k)
+        x = model.steady_state(all_inputs)
+        if y is not None:
+            # (I - A) x = B change + on_states w and C x = y - y_op - D change - on_outputs w
+            of_x = np.vstack([np.eye(n) - model.A, model.C / self.noise[:, None]])
+            of_w = np.vstack([-loads.on_states, loads.on_outputs / self.noise[:, None]])
+            surplus = (as_vector("y", y, model.n_outputs) - model.y_op - model.D @ change) / self.noise
+            wanted = np.concatenate([model.B @ change, surplus])
+            left, size, _ = np.linalg.svd(of_x)
+            free = left[:, np.count_nonzero(size > 1e-9 * size.max(initial=0.0)) :].T  # whatever x is
+            w = np.linalg.lstsq(free @ of_w, free @ wanted, rcond=1e-9)[0]
+            x = np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
+        B = len(self.members)
+        usual = (
+            ~self._jumps / max(1, np.count_nonzero(~self._jumps))
+            if not self._jumps.all()
+            else np.full(B, 1 / B)
+        )
+        return self._estimate(np.tile(np.concatenate([x, w, np.zeros(k)]), (B, 1)), usual, usual)
+
+    def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
+        """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
+        bank = _bank(last)
+        known = np.concatenate((u, v_last, v, y, _ONE))
+        if not is_usable(known) or not is_usable(bank.members.ravel()):
+            return None
+        c, mixed = self._mixed(bank)
+        n_z, l = mixed.shape[1], len(y)
+        if self._together is None:
+            each = np.matmul(self._of_states, mixed[:, :, None])[:, :, 0].ravel() + self._of_known.dot(known)
+        else:
+            each = self._together.dot(np.concatenate((mixed.ravel(), known)))
+        if not is_usable(each):
+            return None
+        each = each.reshape(len(c), -1)
+        seen = c.dot(each[:, n_z:-l])  # innovation and movement of the mixture
+        estimate = self._weighed(each[:, :n_z], c, bank.usual, each[:, -l:], self.filters(self._all))
+        return Updated(estimate, seen[:l], seen[l:])
+
+    def _everyday(self) -> tuple[Array, Array]:
+        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1) to all that `update` needs.
+
+        For each hypothesis: z corrected, innovation, movement of the outputs, innovation made white.
+        """
+        model = self.model
+        n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
+        u, v_last, v, y, one = np.split(np.eye(m + 2 * d + l + 1), np.cumsum([m, d, d, l]))
+        op = np.outer(model.all_inputs_op, one)
+        drive = model.B @ (np.vstack([u, v_last]) - op)
+        surplus = y - np.outer(model.y_op, one) - model.D @ (np.vstack([u, v]) - op)
+        of_states, of_known = [], []
+        filters = self.filters(self._all)
+        for A, C, K, W in zip(self._A, self._C, filters.gains, filters.whiten, strict=True):
+            driven = np.vstack([drive, np.zeros((len(A) - n, drive.shape[1]))])
+            moved = model.C @ (A[:n] - np.eye(n, len(A)))
+            innovation = surplus - C @ driven
+            of_states.append(np.vstack([A - K @ C @ A, -C @ A, moved, -W @ C @ A]))
+            of_known.append(np.vstack([driven + K @ innovation, innovation, model.C @ drive, W @ innovation]))
+        return np.stack(of_states), np.vstack(of_known)
+
+    def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
+        """One sample on, with the inputs u (m,) and disturbances v (d,) since."""
+        bank, model = _bank(last), self.model
+        c, mixed = self._mixed(bank)
+        members = np.matmul(self._A, mixed[:, :, None])[:, :, 0]
+        members[:, : model.n_states] += model.B @ self._change(u, v)
+        return self._estimate(members, c, bank.usual)
+
+    def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
+        """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
+        bank, model = _bank(predicted), self.model
+        expected = model.y_op + bank.weights @ self._seen(bank.members) + model.D @ self._change(u, v)
+        innovation: Array = y - expected
+        return innovation
+
+    def corrected(
+        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
+    ) -> BankEstimate:
+        """Correct with the innovation (l,) of the mixture, of which only the outputs `believed` count."""
+        bank, believed = _bank(predicted), self._all if believed is None else believed
+        seen, filters = self._seen(bank.members), self.filters(believed)
+        each = np.where(believed, innovation, 0.0) + bank.weights @ seen - seen
+        members = bank.members + np.matmul(filters.gains, each[:, :, None])[:, :, 0]
+        white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
+        return self._weighed(members, bank.weights, bank.usual, white, filters)
+
+    def filters(self, believed: BoolArray) -> Filters:
+        """The gains where only some outputs, bool (l,), are believed."""
+        key = believed.tobytes()
+        filters = self._filters.get(key)
+        if filters is None:
+            whiten = np.zeros((len(self.members), len(believed), len(believed)))
+            log_scale = np.zeros(len(self.members))
+            for b, member in enumerate(self.members):
+                root = np.linalg.cholesky(member.innovation_covariance(believed))
+                whiten[b][np.ix_(believed, believed)] = np.linalg.inv(root)
+                log_scale[b] = -np.log(np.diag(root) / self.noise[believed]).sum()
+            gains = np.stack([member.gain(believed) for member in self.members])
+            filters = self._filters[key] = Filters(gains, whiten, log_scale)
+        return filters
+
+    def _mixed(self, bank: BankEstimate) -> tuple[Array, Array]:
+        """How likely each hypothesis is now, before the measurement, shape (B,); and where its filter starts."""
+        weights = bank.weights
+        joint = weights[:, None] * (self._chances + self._returns[:, None] * bank.usual)
+        c = self._ones.dot(joint)
+        return c, joint.T.dot(bank.members) / c[:, None]
+
+    def _weighed(
+        self, members: Array, c: Array, usual: Array, white: Array, filters: Filters
+    ) -> BankEstimate:
+        """The estimate after Bayes' rule, from the innovations made white, shape (B, l)."""
+        likelihood = filters.log_scale - 0.5 * np.einsum("bi,bi->b", white, white)
+        weights = c * np.exp(likelihood - likelihood[likelihood.argmax()])
+        weights /= weights.dot(self._ones)
+        usual = np.maximum((1 - FORGETS) * usual + FORGETS * weights, LEAST) * self._lasts
+        usual /= usual.dot(self._ones)
+        return self._estimate(members, weights, usual)
+
+    def _estimate(self, members: Array, weights: Array, usual: Array) -> BankEstimate:
+        plan = (weights[:, None] * members).ravel().dot(self._mixture)
+        l, m = self.model.n_outputs, self.model.n_inputs
+        return BankEstimate(plan[: -m - l], plan[-l:], plan[-m - l : -l], members, weights, usual)
+
+    def _seen(self, members: Array) -> Array:
+        """The outputs of every hypothesis beside those of the inputs, shape (B, l)."""
+        seen: Array = np.matmul(self._C, members[:, :, None])[:, :, 0]
+        return seen
+
+    def _change(self, u: Array, v: Array | None) -> Array:
+        """All inputs of the model as differences from the operating point, shape (m + d,)."""
+        model = self.model
+        change: Array = np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op
+        return change
+
+
+def _chances(jumps: BoolArray) -> tuple[Array, Array]:
+    """The chances T that do not depend on what usually holds, and what share of each jump returns to that."""
+    if jumps.all() or len(jumps) == 1:
+        return np.eye(len(jumps)), np.zeros(len(jumps))
+    others = np.outer(~jumps, ~jumps) & ~np.eye(len(jumps), dtype=bool)
+    to_jump = np.outer(~jumps, jumps)
+    chances = TO_JUMP * _shared(to_jump) + (1 - STAYS - TO_JUMP) * _shared(others)
+    chances += np.diag(np.where(jumps, JUMP_GOES_ON, 1 - chances.sum(axis=1)))
+    return chances, np.where(jumps, 1 - JUMP_GOES_ON, 0.0)
+
+
+def _shared(places: BoolArray) -> Array:
+    """Every row's chance of one, shared by its places; zeros in rows without any."""
+    count: Array = places.sum(axis=1, keepdims=True).astype(np.float64)
+    return places / np.maximum(count, 1.0)
+
+
+def _diagonal(blocks: Array) -> Array:
+    """Blocks (B, rows, columns) along the diagonal of one matrix."""
+    count, rows, columns = blocks.shape
+    matrix = np.zeros((count, rows, count, columns))
+    matrix[np.arange(count), :, np.arange(count)] = blocks
+    return matrix.reshape(count * rows, count * columns)
+
+
+def _bank(estimate: Estimate) -> BankEstimate:
+    if not isinstance(estimate, BankEstimate):
+        raise MampcError(f"estimate: expected one of a LoadBank, received {type(estimate).__name__}")
+    return estimate
