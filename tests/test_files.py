@@ -11,7 +11,7 @@ import mampc
 from mampc.base.csv_table import CSV_FILE_LIMIT, CSVTable
 from mampc.base.files import written_whole
 from mampc.report.folder import MANIFEST, ResultFolder
-from mampc.systems.state_space import MOST_SIGNALS
+from mampc.systems.state_space import MOST_STATES
 
 READERS = {
     "model": mampc.StateSpace.load,
@@ -65,14 +65,14 @@ def test_a_record_is_bounded_and_takes_little_more_memory_than_its_file(tmp_path
 
 
 def test_a_model_file_has_a_bounded_order_both_ways(tmp_path):
-    n = MOST_SIGNALS + 1
+    n = MOST_STATES + 1
     large = mampc.StateSpace(np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n)), None, 1.0)
-    with pytest.raises(mampc.MampcError, match=r"at most 200 states.*received 201, 1 and 1"):
+    with pytest.raises(mampc.MampcError, match=r"at most 500 states.*received 501, 1 and 1"):
         large.save(tmp_path / "large.json")
     mampc.StateSpace([[0.5]], [[1.0]], [[1.0]], None, 1.0).save(tmp_path / "model.json")
     content = json.loads((tmp_path / "model.json").read_text())
     content |= {name: getattr(large, name).tolist() for name in "ABC"}
     content["names"]["states"] = []
     (tmp_path / "model.json").write_text(json.dumps(content))
-    with pytest.raises(mampc.MampcError, match=r"at most 200 states.*received 201, 1 and 1"):
+    with pytest.raises(mampc.MampcError, match=r"at most 500 states.*received 501, 1 and 1"):
         mampc.StateSpace.load(tmp_path / "model.json")

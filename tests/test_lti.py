@@ -403,7 +403,7 @@ def test_missing_files_directories_and_huge_files_are_refused(tmp_path):
     huge = tmp_path / "huge.json"
     with huge.open("wb") as file:
         file.truncate(MODEL_FILE_LIMIT + 1)
-    with pytest.raises(MampcError, match="at most 8 MiB"):
+    with pytest.raises(MampcError, match="at most 16 MiB"):
         StateSpace.load(huge)
     for path in (tmp_path, tmp_path / "missing.json"):
         with pytest.raises(MampcError, match="expected a readable mampc model file"):

@@ -36,9 +36,10 @@ from mampc.methods import (
 )
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.systems.linearisation import linearise
 from mampc.systems.mismatch import Mismatch
 from mampc.systems.signals import prbs, steps
-from mampc.systems.state_space import StateSpace, linearise
+from mampc.systems.state_space import StateSpace
 
 __version__ = "0.1.0"
 

@@ -20,8 +20,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_array, as_number, require_finite
 from mampc.base.errors import MampcError
-
-MOST_STATES = 500  # of a model; far beyond it, a controller takes minutes to build
+from mampc.systems.state_space import MOST_STATES
 
 
 def first_order(

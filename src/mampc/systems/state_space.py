@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -22,8 +22,9 @@ from mampc.base.errors import MampcError
 from mampc.base.files import read_text, written_whole
 from mampc.base.names import Names, require_count
 
-MODEL_FILE_LIMIT = 8 * 2**20  # bytes; the largest model fits with room to spare
-MOST_SIGNALS = 200  # states of a model in a file, and inputs, and outputs; far beyond it, a study takes hours
+MODEL_FILE_LIMIT = 16 * 2**20  # bytes; the largest model fits with room to spare
+MOST_STATES = 500  # of a model in a file; far beyond it, a controller takes minutes to build
+MOST_SIGNALS = 200  # inputs of a model in a file, and outputs; far beyond it, a study takes hours
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,6 +277,40 @@ class StateSpace:
         return cls(A, B, C, D, dt, u_op, y_op, names, v_op)  # type: ignore[arg-type]
 
     @classmethod
+    def from_step_response(
+        cls,
+        coefficients: Any,
+        *,
+        dt: float,
+        accuracy: float = 0.01,
+        u_op: Any = None,
+        y_op: Any = None,
+        names: Names | None = None,
+        v_op: Any = None,
+    ) -> StateSpace:
+        """A model of as few states as describe step responses to a given accuracy, such as those of a DMC model.
+
+        Responses that still move at the end go on: along a line (an integrator) where the time constant of their
+        last sixth is longer than the record, else towards where that exponential leads. All others stay at their
+        last coefficient.
+
+        Args:
+            coefficients: S, shape (N, l, m): output i, k samples after a unit step of input j, is S[k, i, j];
+                S[0] is D, zero for most plants.
+            dt: sample time in seconds.
+            accuracy: largest error of any coefficient, as a share of the largest of its output and input.
+            u_op, y_op, names, v_op: as for `StateSpace`.
+
+        Raises:
+            MampcError: what is no step response, or none that 500 states describe to this accuracy.
+        """
+        from mampc.systems.step_model import step_model
+
+        A, B, C, D = step_model(coefficients, accuracy)
+        dt = as_number("dt", dt, 0.0, exclusive=True)
+        return cls(A, B, C, D, dt, u_op, y_op, names, v_op)  # type: ignore[arg-type]
+
+    @classmethod
     def from_any(cls, system: Any, dt: float | None = None) -> StateSpace:
         """Build from a python-control or scipy.signal system, or a tuple (A, B, C, D[, dt]).
 
@@ -284,7 +319,8 @@ class StateSpace:
         time of unstated length and its dt = None leaves the kind of time open.
 
         Args:
-            system: the object; transfer functions are realised by their own library.
+            system: the object. Transfer functions of python-control may have many inputs and outputs; their
+                channels are realised one by one, and what is redundant is left out.
             dt: wanted sample time in seconds. A continuous system is sampled (zero-order hold), an
                 unstated sample time is taken to be this one, a stated one must agree.
 
@@ -294,7 +330,9 @@ class StateSpace:
         if isinstance(system, StateSpace):
             model = system
         else:
-            A, B, C, D, own_dt = _matrices(system)
+            from mampc.systems.conversion import matrices_of
+
+            A, B, C, D, own_dt = matrices_of(system)
             if own_dt is None and dt is None:
                 raise MampcError(
                     "from_any: expected a sample time, received a system that states none; pass dt="
@@ -350,93 +388,14 @@ class StateSpace:
         return model
 
     def _require_moderate(self, path: str | Path) -> None:
-        largest = max(*self.B.shape, self.n_outputs)
-        if largest > MOST_SIGNALS:
+        if self.n_states > MOST_STATES or max(self.D.shape) > MOST_SIGNALS:
             raise MampcError(
-                f"{path}: expected a model of at most {MOST_SIGNALS} states, inputs and outputs each, "
+                f"{path}: expected a model of at most {MOST_STATES} states and {MOST_SIGNALS} inputs and outputs each, "
                 f"received {self.n_states}, {self.B.shape[1]} and {self.n_outputs}; reduce its order"
             )
-
-
-class Differentiable(Protocol):
-    """What `linearise` needs of a plant: dx/dt = derivative(x, u), y = output(x, u), a rest state."""
-
-    def derivative(self, x: Array, u: Array) -> Array: ...
-    def output(self, x: Array, u: Array) -> Array: ...
-    def steady_state(self, u: Any = None) -> Array: ...
-
-
-def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
-    """The continuous-time linear model of a plant about its steady state at inputs u.
-
-    Jacobians by central differences with steps of 1e-6 of each variable's size.
-
-    Args:
-        plant: with `derivative`, `output`, `steady_state`; its `names`, `u_op` and `v_op` (measured
-            disturbances) are used if it has them.
-        u: inputs at the operating point, shape (m,) or (m + d,); default the plant's.
-    """
-    given = getattr(plant, "u_op", None) if u is None else u
-    if given is None:
-        raise MampcError(f"linearise: expected inputs u, since {type(plant).__name__} has no u_op")
-    inputs = as_array("u", given)
-    names: Names | None = getattr(plant, "names", None)
-    m = len(inputs) if names is None else len(names.inputs)
-    if names is not None and len(inputs) == m:
-        inputs = np.concatenate([inputs, as_array("v_op", getattr(plant, "v_op", ()))])
-        names = names if len(inputs) > m else names.undisturbed()
-    x_op = as_array("steady_state", plant.steady_state(inputs))
-
-    def jacobian(function: Any, point: Array) -> Array:
-        columns = []
-        for i, value in enumerate(point):
-            step = np.zeros_like(point)
-            step[i] = 1e-6 * max(1.0, abs(value))
-            columns.append((function(point + step) - function(point - step)) / (2 * step[i]))
-        return np.stack(columns, axis=-1)
-
-    return StateSpace(
-        A=jacobian(lambda x: plant.derivative(x, inputs), x_op),
-        B=jacobian(lambda v: plant.derivative(x_op, v), inputs),
-        C=jacobian(lambda x: plant.output(x, inputs), x_op),
-        D=jacobian(lambda v: plant.output(x_op, v), inputs),
-        dt=0.0,
-        u_op=inputs[:m],
-        y_op=plant.output(x_op, inputs),
-        names=names,  # type: ignore[arg-type]
-        v_op=inputs[m:],
-    )
 
 
 def _listed(names: tuple[str, ...]) -> str:
     """The names, those after the fourth only counted."""
     shown = [name if len(name) <= 20 else f"{name[:19]}…" for name in names[:4]]
     return " ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-
-
-def _matrices(system: Any) -> tuple[Any, Any, Any, Any, float | None]:
-    """A, B, C, D and the sample time: 0 for continuous, None where the system leaves it open."""
-    origin = type(system).__module__.split(".")[0]
-    try:
-        if origin == "control":
-            if not hasattr(system, "A"):
-                import control
-
-                system = control.ss(system)
-            return system.A, system.B, system.C, system.D, _stated(system.dt)
-        if origin == "scipy" and hasattr(system, "to_ss"):
-            model = system.to_ss()
-            return model.A, model.B, model.C, model.D, 0.0 if model.dt is None else _stated(model.dt)
-        if isinstance(system, (tuple, list)) and len(system) in (4, 5):
-            return *system[:4], _stated(system[4] or 0.0) if len(system) == 5 else 0.0
-    except (TypeError, ValueError, NotImplementedError) as error:  # improper, or beyond the library
-        raise MampcError(f"from_any: expected a system with a state-space form, received: {error}") from None
-    raise MampcError(
-        "from_any: expected a python-control or scipy.signal system or (A, B, C, D[, dt]), "
-        f"received {type(system).__name__}"
-    )
-
-
-def _stated(dt: Any) -> float | None:
-    """A sample time, or None where a library's None or True leaves it open."""
-    return None if dt is None or dt is True else float(dt)

@@ -1,0 +1,157 @@
+"""State-space models of step responses, such as those of dynamic matrix control, by balanced truncation.
+
+A response that has settled is a finite impulse response. Its Hankel matrix, zero beyond the last coefficient, is
+that of a shift register, and the singular vectors of the largest singular values are its balanced truncation,
+which is always stable. What clearly has not settled by the end goes on as its last sixth does: along a line (an
+integrator) where its time constant is longer than the record, else towards where an exponential leads. These tails
+are states of their own, and what is left of the responses has settled.
+
+Source: Kung, 12th Asilomar Conference (1978); Cutler and Ramaker, Joint Automatic Control Conference (1980).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_array, as_number, require_finite
+from mampc.base.errors import MampcError
+from mampc.systems.state_space import MOST_STATES
+
+MOST_COEFFICIENTS = 2000
+LARGEST_HANKEL = 2000  # columns of the Hankel matrix; its decomposition takes the cube of it
+ABSENT = 1e-9  # of the largest beside it: a channel of rounding alone
+CLEAR = 6.0  # roughnesses of a tail by which it has to move to be more than noise
+FINEST = 1e-6  # accuracies below it are lost in the squares of the Hankel matrix
+
+Matrices = tuple[Array, Array, Array, Array]
+
+
+def step_model(S: Any, accuracy: float) -> Matrices:
+    """A, B, C, D of step responses S (N, l, m); see `StateSpace.from_step_response`."""
+    S = _checked(S)
+    if not FINEST <= as_number("accuracy", accuracy) < 1:
+        raise MampcError(f"accuracy: expected a share from {FINEST:g} to below 1, received {accuracy:g}")
+    largest = np.abs(S).max(axis=0)
+    rows = np.where(largest.any(axis=1), largest.max(axis=1), 1.0)
+    columns = (largest / rows[:, None]).max(axis=0)
+    columns[columns == 0] = 1.0
+    S = S / rows[:, None] / columns  # the largest in each row and column is about one
+    size = np.abs(S).max(axis=0)
+    present = size > ABSENT
+    allowed = np.where(present, accuracy * size, ABSENT)
+    S = np.where(present, S, 0.0)
+
+    tails, settled = _tails(S, accuracy)
+    for A, B, C, D in _truncations(settled):
+        matrices = _beside((A, B, C, D), tails)
+        if (np.abs(_response(matrices, len(S)) - S) <= allowed).all():
+            A, B, C, D = matrices
+            return A, B * columns, rows[:, None] * C, rows[:, None] * D * columns
+    raise MampcError(
+        f"from_step_response: expected responses that at most {MOST_STATES} states describe to {100 * accuracy:g} %; "
+        "allow more with accuracy, or leave out samples"
+    )
+
+
+def _checked(given: Any) -> Array:
+    S = as_array("from_step_response", given)
+    if S.ndim != 3 or 0 in S.shape or not 2 <= len(S) <= MOST_COEFFICIENTS:
+        raise MampcError(
+            "from_step_response: expected coefficients of shape (N, outputs, inputs), N from 2 to "
+            f"{MOST_COEFFICIENTS}, the first of them D, received shape {S.shape}"
+        )
+    require_finite("from_step_response", S)
+    if (len(S) - 1) * min(S.shape[1:]) > LARGEST_HANKEL:
+        raise MampcError(
+            f"from_step_response: expected at most {LARGEST_HANKEL} coefficients of the outputs or of the inputs, "
+            f"received shape {S.shape}; leave out samples"
+        )
+    if not S.any():
+        raise MampcError("from_step_response: expected outputs that answer, received zeros alone")
+    return S
+
+
+def _tails(S: Array, accuracy: float) -> tuple[Matrices, Array]:
+    """What goes on beyond the record, as a model, and the responses without it."""
+    N, l, m = S.shape
+    span = max(1, N // 6)
+    poles, slopes = np.zeros((l, m)), np.zeros((l, m))
+    if 2 * span < N - 1:
+        now, before = S[-1] - S[-1 - span], S[-1 - span] - S[-1 - 2 * span]
+        roughness = np.std(np.diff(S[-1 - 2 * span :], 2, axis=0), axis=0) / np.sqrt(6.0)
+        moving = np.abs(now) > np.maximum(accuracy * np.abs(S).max(axis=0), CLEAR * roughness)
+        decay = np.where(moving, now / np.where(before == 0, np.inf, before), 0.0)
+        integrates = decay >= np.exp(-span / N)
+        settles = ~integrates & (decay >= np.exp(-1.0))
+        poles = np.where(settles, np.where(settles, decay, 1.0) ** (1 / span), poles)
+        slopes = np.where(integrates, now / span, 0.0)
+    A, B, C = _integrators(slopes, accuracy)
+    for i, j in np.argwhere(poles > 0).tolist():
+        p = poles[i, j]
+        last = (S[-1, i, j] - S[-1 - span, i, j]) * (1 - p) / (p**-span - 1)  # the next change is p times it
+        A = np.block([[A, np.zeros((len(A), 1))], [np.zeros((1, len(A))), np.array([[p]])]])
+        B = np.vstack([B, np.eye(m)[j : j + 1]])
+        C = np.hstack([C, last * p ** -(N - 2.0) * np.eye(l)[:, i : i + 1]])
+    tails = A, B, C, np.zeros((l, m))
+    return tails, S - _response(tails, N)
+
+
+def _integrators(slopes: Array, accuracy: float) -> tuple[Array, Array, Array]:
+    """As few integrators as make these slopes, (l, m) per sample."""
+    left, size, right = np.linalg.svd(slopes, full_matrices=False)
+    count = int((size > accuracy * max(float(size.max(initial=0.0)), 1e-300)).sum())
+    root = np.sqrt(size[:count])
+    return np.eye(count), root[:, None] * right[:count], left[:, :count] * root
+
+
+def _truncations(S: Array) -> Any:
+    """Balanced truncations of settled responses, of growing order."""
+    pulses = np.diff(S, axis=0)
+    N, l, m = pulses.shape
+    if l < m:  # the smaller side is decomposed
+        for A, B, C, D in _truncations(S.transpose(0, 2, 1)):
+            yield A.T, C.T, B.T, D.T
+        return
+    hankel = np.zeros((N, l, N, m))
+    for k in range(N):
+        hankel[k, :, : N - k] = pulses[k:].transpose(1, 0, 2)
+    square = hankel.reshape(N * l, N * m)
+    values, right = np.linalg.eigh(square.T @ square)
+    kept = np.flatnonzero(values > max(float(values[-1]), 1e-300) * FINEST**2)[::-1][:MOST_STATES]
+    root = np.sqrt(np.sqrt(values[kept]))
+    reach = (right[:, kept] * root).T.reshape(len(root), N, m)
+    # A moves past inputs back by one sample.
+    older = np.concatenate([reach[:, 1:], np.zeros_like(reach[:, :1])], axis=1)
+    A = older.reshape(len(root), N * m) @ (right[:, kept] / root)
+    C = (square[:l] @ right[:, kept]) / root
+    for order in _orders(len(root)):
+        yield A[:order, :order], reach[:order, 0], C[:, :order], S[0]
+
+
+def _orders(most: int) -> list[int]:
+    """Every order up to 20, then such as are a tenth apart."""
+    orders = list(range(min(most, 20) + 1))
+    while orders[-1] < most:
+        orders.append(min(most, orders[-1] + max(1, orders[-1] // 10)))
+    return orders
+
+
+def _beside(one: Matrices, other: Matrices) -> Matrices:
+    """The sum of two models."""
+    n, q = len(one[0]), len(other[0])
+    A = np.block([[one[0], np.zeros((n, q))], [np.zeros((q, n)), other[0]]])
+    return A, np.vstack([one[1], other[1]]), np.hstack([one[2], other[2]]), one[3] + other[3]
+
+
+def _response(matrices: Matrices, samples: int) -> Array:
+    """The step response, (samples, l, m)."""
+    A, B, C, D = matrices
+    pulses = np.empty((samples, *D.shape))
+    pulses[0] = D
+    for k in range(1, samples):
+        pulses[k] = C @ B
+        B = A @ B
+    response: Array = np.cumsum(pulses, axis=0)
+    return response
