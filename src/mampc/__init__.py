@@ -38,6 +38,7 @@ from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.linearisation import linearise
 from mampc.systems.mismatch import Mismatch
+from mampc.systems.noise import Noise
 from mampc.systems.signals import prbs, steps
 from mampc.systems.state_space import StateSpace
 
@@ -71,6 +72,7 @@ __all__ = [
     "Mismatch",
     "MoveRules",
     "Names",
+    "Noise",
     "PenaltyDecomposition",
     "Recording",
     "Regulator",

@@ -22,11 +22,14 @@ from mampc.identification.triangular import fold, solve
 HIGHEST = 8  # order of one output
 
 
-def estimate_arx(records: Scaled, delays: Integers, settings: Settings, trend: str) -> list[Part]:
+def estimate_arx(
+    records: Scaled, delays: Integers, settings: Settings, trend: str, orders: Sequence[int] | None = None
+) -> list[Part]:
     """One part per output, each with the smallest order that explains the record nearly best.
 
     Args:
         delays: in samples, shape (l, m).
+        orders: one per output, if they are known.
     """
     parts = []
     for i, row in enumerate(delays):
@@ -38,7 +41,8 @@ def estimate_arx(records: Scaled, delays: Integers, settings: Settings, trend: s
         def dynamics(n: int, seen: Scaled = seen) -> tuple[Array, Array]:
             return _companion(_denominator(seen.u, seen.y, n, PROJECTED[trend]))
 
-        parts.append(finished(dynamics, range(1, most + 1), own, seen, (i,), row, settings, trend))
+        tried = range(1, most + 1) if orders is None else (orders[i],)
+        parts.append(finished(dynamics, tried, own, seen, (i,), row, settings, trend))
     return parts
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,12 +14,15 @@ from mampc.base.errors import MampcError
 from mampc.identification.arx import estimate_arx
 from mampc.identification.data import IOData
 from mampc.identification.delays import Integers, find_delays
+from mampc.identification.drift import white_and_walk
 from mampc.identification.estimate import DEGREES, Settings, estimate
 from mampc.identification.held_out import AS_GOOD, CLEARLY, RIVAL, WALK, compared, errors, split
-from mampc.identification.parts import Part, assembled, groups
+from mampc.identification.parts import Part, assembled, groups, part_residuals
 from mampc.identification.scaling import Scaled, scaled
 from mampc.identification.subspace import WEIGHTINGS
+from mampc.identification.uncertainty import jackknife
 from mampc.identification.validation import Validation, validate
+from mampc.systems.noise import Noise
 from mampc.systems.state_space import StateSpace
 
 DETREND = ("auto", *DEGREES)
@@ -63,6 +66,26 @@ class Identified:
     notes: tuple[str, ...]
     fit: Array
     stabilised: bool
+    _estimate: _Estimate = field(repr=False)
+
+    def uncertainty(self, samples: int, *, segments: int = 8) -> Array:
+        """Standard deviations of the step response, shape (samples, l, m + d); see `StateSpace.step_response`.
+
+        The model is estimated again, trend, dead times and order as they are, without one segment of the record
+        after another. What all of these share, such as a disturbance that moved with an input, does not show.
+
+        Args:
+            samples: of the response.
+            segments: at least 3.
+
+        Raises:
+            MampcError: records too short for that.
+        """
+        as_whole("segments", segments, 3)
+        as_whole("samples", samples, 1)
+        return jackknife(
+            self._estimate.records, segments, lambda rest: self._estimate.response(rest, samples)
+        )
 
     def validate(self, data: IOData) -> Validation:
         """Simulate the model on another record, drifts set aside as they were here; see `mampc.validate`."""
@@ -121,7 +144,7 @@ def n4sid(
     choice = _chosen(records, settings, detrend, dead)
     values: list[Array] = []
     parts = _parts(records, settings, choice, values)
-    model = assembled(parts, records, first)
+    model = replace(assembled(parts, records, first), noise=_noise(parts, records))
     integrators = sum(part.integrators for part in parts)
     notes = list(choice.notes)
     if integrators:
@@ -138,6 +161,7 @@ def n4sid(
         notes=tuple(notes),
         fit=quality.fit,
         stabilised=any(part.stabilised for part in parts),
+        _estimate=_Estimate(records, settings, choice, tuple(len(part.A) for part in parts), first),
     )
 
 
@@ -161,15 +185,45 @@ class _Score(NamedTuple):
     states: int
 
 
+@dataclass(frozen=True, eq=False)
+class _Estimate:
+    """What it takes to estimate a model again from other samples: its orders stay."""
+
+    records: Scaled
+    settings: Settings
+    choice: _Choice
+    orders: tuple[int, ...]
+    like: IOData
+
+    def response(self, records: Scaled, samples: int) -> Array:
+        """The step response of the model of other records, shape (samples, l, m + d)."""
+        parts = _parts(records, self.settings, self.choice, orders=self.orders)
+        return assembled(parts, records, self.like).step_response(samples)
+
+
+def _noise(parts: Sequence[Part], records: Scaled) -> Noise:
+    """White noise and random walk in what the parts leave, in output units."""
+    output, drift = np.zeros((2, len(records.y_spread)))
+    for part in parts:
+        picked = list(part.outputs)
+        output[picked], drift[picked] = white_and_walk(part_residuals(part, records))
+    return Noise(output * records.y_spread, drift * records.y_spread)
+
+
 def _parts(
-    records: Scaled, settings: Settings, choice: _Choice, values: list[Array] | None = None
+    records: Scaled,
+    settings: Settings,
+    choice: _Choice,
+    values: list[Array] | None = None,
+    orders: Sequence[int] | None = None,
 ) -> list[Part]:
-    """The parts of a model; appends the singular values of each."""
+    """The parts of a model, of given orders if any; appends the singular values of each."""
     if choice.rival:
-        return estimate_arx(records, choice.delays, settings, choice.trend)
+        return estimate_arx(records, choice.delays, settings, choice.trend, orders)
     parts = []
-    for outputs, delays in groups(choice.delays):
-        part, own = estimate(records, outputs, delays, settings, choice.trend)
+    for k, (outputs, delays) in enumerate(groups(choice.delays)):
+        fixed = settings if orders is None else replace(settings, order=orders[k])
+        part, own = estimate(records, outputs, delays, fixed, choice.trend)
         parts.append(part)
         if values is not None:
             values.append(own)

@@ -19,6 +19,7 @@ from mampc.base.errors import MampcError
 from mampc.identification.triangular import fold
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
+_TREND = 4  # windows that a trend may take up
 _CHUNK = 4096  # Hankel columns taken into the triangular factor at once
 
 
@@ -62,7 +63,9 @@ def supported_order(correlations: Array, columns: int, m: int, l: int, s: int) -
 
 
 def require_excitation(R: Array, m: int, s: int) -> None:
-    """The inputs must be linearly independent over 2 s samples, and not constant."""
+    """The records must be long enough, and the inputs linearly independent over 2 s samples and not constant."""
+    if len(R) + _TREND < R.shape[1]:
+        raise MampcError(f"n4sid: expected at least {R.shape[1]} windows of samples, received {len(R)}")
     inputs = R[:, : 2 * s * m]
     length = np.linalg.norm(inputs, axis=0)
     size = np.abs(np.diag(inputs)) / np.maximum(length, 1e-300)

@@ -186,11 +186,12 @@ class KalmanFilter(Estimator):
         if disturbance == "input" and m < l:
             raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")
         reach = response_within_reach(model)
-        noise = (
-            alike(reach)
-            if measurement_noise is None
-            else _positive("measurement_noise", measurement_noise, l)
-        )
+        if measurement_noise is not None:
+            noise = _positive("measurement_noise", measurement_noise, l)
+        elif model.noise is not None and (model.noise.output > 0).all():
+            noise = model.noise.output
+        else:
+            noise = alike(reach)
         effect = np.linalg.norm(reach / noise[:, None], axis=0) / np.sqrt(l)
         unit = np.where(
             effect > 0, 1 / np.where(effect > 0, effect, 1.0), 0.0

@@ -21,6 +21,7 @@ from mampc.base.checks import Array, ComplexArray, as_array, as_matrix, as_numbe
 from mampc.base.errors import MampcError
 from mampc.base.files import read_text, written_whole
 from mampc.base.names import Names, require_count
+from mampc.systems.noise import Noise
 
 MODEL_FILE_LIMIT = 16 * 2**20  # bytes; the largest model fits with room to spare
 MOST_STATES = 500  # of a model in a file; far beyond it, a controller takes minutes to build
@@ -37,6 +38,7 @@ class StateSpace:
         u_op, y_op: operating point in engineering units, shapes (m,), (l,); default zeros.
         names: signal names; default u1.., y1.., x1.., and no measured disturbances (d = 0).
         v_op: measured disturbances at the operating point, shape (d,); default zeros.
+        noise: what a record said of the disturbances, or None.
 
     Raises:
         MampcError: shapes that do not fit together, non-finite numbers, a negative dt.
@@ -51,6 +53,7 @@ class StateSpace:
     y_op: Array = None  # type: ignore[assignment]
     names: Names = None  # type: ignore[assignment]
     v_op: Array = None  # type: ignore[assignment]
+    noise: Noise | None = None
 
     def __post_init__(self) -> None:
         A = as_matrix("A", self.A)
@@ -77,6 +80,8 @@ class StateSpace:
             "y_op": as_vector("y_op", 0.0 if self.y_op is None else self.y_op, l),
             "v_op": as_vector("v_op", 0.0 if self.v_op is None else self.v_op, d),
         }  # fmt: skip
+        if self.noise is not None and self.noise.output.shape != (l,):
+            raise MampcError(f"noise: expected {l} outputs, received {self.noise.output.size}")
         for name, value in checked.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
@@ -362,6 +367,8 @@ class StateSpace:
             **{k: np.asarray(getattr(self, k)).tolist() for k in arrays},
             "names": {k: list(names) for k, names in asdict(self.names).items()},
         }
+        if self.noise is not None:
+            content["noise"] = {k: value.tolist() for k, value in asdict(self.noise).items()}
         with written_whole(path) as unfinished:
             unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -379,7 +386,8 @@ class StateSpace:
         try:
             names = Names(**{k: tuple(v) for k, v in content["names"].items()})
             matrices = {k: content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")}
-            model = cls(**matrices, names=names, v_op=content.get("v_op", 0.0))
+            noise = Noise(**content["noise"]) if "noise" in content else None
+            model = cls(**matrices, names=names, v_op=content.get("v_op", 0.0), noise=noise)
         except (KeyError, TypeError, AttributeError) as error:
             raise MampcError(f"{path}: expected A, B, C, D, dt, u_op, y_op, names; {error!r}") from None
         except MampcError as error:

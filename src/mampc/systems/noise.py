@@ -1,0 +1,39 @@
+"""What a record says of the disturbances of a plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_vector
+from mampc.base.errors import MampcError
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Disturbances at the outputs of a model, in output units.
+
+    What a simulation leaves of a record is split into white noise and a random walk. The walk holds loads, drifts
+    and what the model lacks.
+
+    Args:
+        output: standard deviation of the white noise of each output, shape (l,).
+        drift: standard deviation of the steps of each output's random walk in one sample, shape (l,).
+
+    Raises:
+        MampcError: negative numbers, or others that are not finite.
+    """
+
+    output: Array
+    drift: Array
+
+    def __post_init__(self) -> None:
+        size = np.size(self.output)
+        for name in ("output", "drift"):
+            value: Any = as_vector(f"noise.{name}", getattr(self, name), size)
+            if (value < 0).any():
+                raise MampcError(f"noise.{name}: expected numbers of at least zero, received {value}")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)

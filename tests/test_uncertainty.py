@@ -1,0 +1,91 @@
+"""What a model knows of its own errors: noise kept with it, and step responses with standard deviations."""
+
+import numpy as np
+import pytest
+
+import mampc
+from mampc import IOData, MampcError, Noise, StateSpace, n4sid, prbs
+from mampc.identification.drift import white_and_walk
+
+PLANT = StateSpace(
+    [[0.9, 0.05], [0.0, 0.8]], [[0.1, 0.05], [0.0, 0.3]], np.eye(2), None, 10.0, [5.0, 6.0], [1.0, 2.0]
+)
+
+
+def record(seed, *, samples=800, noise=0.05, walk=0.0, units=(1.0, 1.0)):
+    rng = np.random.default_rng(seed)
+    u = PLANT.u_op + prbs(order=8, hold=5, inputs=2, samples=samples, seed=seed)
+    y = PLANT.response(u)
+    y = y + noise * rng.standard_normal(y.shape) + walk * np.cumsum(rng.standard_normal(y.shape), axis=0)
+    return IOData(u * units[0], y * units[1], PLANT.dt)
+
+
+@pytest.mark.parametrize(("white", "walk"), [(1.0, 0.0), (1.0, 0.3), (0.1, 1.0), (0.0, 1.0)])
+def test_white_noise_and_a_random_walk_are_told_apart(white, walk):
+    rng = np.random.default_rng(0)
+    both = white * rng.standard_normal((20000, 3)) + walk * np.cumsum(rng.standard_normal((20000, 3)), axis=0)
+    found = white_and_walk([both[:12000], both[12000:]])
+    np.testing.assert_allclose(found, np.tile([[white], [walk]], 3), atol=0.15)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e5])
+def test_the_noise_of_a_record_is_kept_with_the_model(unit, tmp_path):
+    model = n4sid(record(0, noise=np.array([0.05, 0.1]), units=(1.0, unit)), feedthrough=False).model
+    np.testing.assert_allclose(model.noise.output / unit, [0.05, 0.1], rtol=0.2)
+    assert (model.noise.drift / unit < 0.03).all()
+    model.save(tmp_path / "model.json")
+    again = StateSpace.load(tmp_path / "model.json").noise
+    assert np.array_equal(again.output, model.noise.output)
+    assert np.array_equal(again.drift, model.noise.drift)
+
+
+def test_the_estimator_starts_from_the_noise_of_the_model():
+    noisy = mampc.StateSpace(
+        PLANT.A, PLANT.B, PLANT.C, None, 10.0, PLANT.u_op, PLANT.y_op, noise=Noise([0.05, 0.5], [0.0, 0.0])
+    )
+    found = mampc.KalmanFilter.offset_free(noisy).gain
+    np.testing.assert_allclose(
+        found, mampc.KalmanFilter.offset_free(PLANT, measurement_noise=[0.05, 0.5]).gain, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "options", [{"output": [-1.0], "drift": [0.0]}, {"output": [1.0], "drift": [np.nan]}]
+)
+def test_noise_that_cannot_be_is_refused(options):
+    with pytest.raises(MampcError, match=r"noise\..*: expected"):
+        Noise(**options)
+
+
+def test_step_responses_err_by_about_their_standard_deviations():
+    true = PLANT.step_response(40)[1:]
+    ratios = []
+    for seed in range(10):
+        fitted = n4sid(record(seed), order=2, feedthrough=False, detrend="constant", delays=0)
+        error = fitted.model.step_response(40)[1:] - true
+        ratios.append(error / fitted.uncertainty(40)[1:])
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+def test_uncertainty_falls_with_the_length_of_the_record_and_grows_with_noise():
+    def typical(**options):
+        fitted = n4sid(record(3, **options), feedthrough=False)
+        return np.sqrt(np.mean(fitted.uncertainty(40) ** 2))
+
+    usual = typical()
+    assert typical(samples=3200) < 0.8 * usual
+    assert typical(noise=0.2) > 2 * usual
+
+
+def test_units_of_the_uncertainty_are_those_of_the_response():
+    u_unit, y_unit = np.array([1e-4, 1e5]), np.array([1e3, 1e-6])
+    plain = n4sid(record(1), feedthrough=False).uncertainty(20)
+    other = n4sid(record(1, units=(u_unit, y_unit)), feedthrough=False).uncertainty(20)
+    np.testing.assert_allclose(other * u_unit / y_unit[:, None], plain, rtol=1e-4, atol=1e-7)
+
+
+def test_a_record_too_short_for_segments_is_told():
+    signals = np.random.default_rng(0).standard_normal((2, 20, 2))
+    fitted = n4sid(IOData(*signals, 1.0), feedthrough=False, order=1)
+    with pytest.raises(MampcError, match=r"uncertainty: expected records"):
+        fitted.uncertainty(10)
