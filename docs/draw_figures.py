@@ -8,9 +8,9 @@ from scipy import signal
 from ugly_export import ugly_export
 
 import mampc
+from mampc.base.drawing import BLACK, BLUE, GREY, VERMILION, legend_above, new_figure, styled
 from mampc.base.tolerances import SAME
 from mampc.identification.export import inspect_export
-from mampc.loop.drawing import BLACK, BLUE, GREY, VERMILION, legend_above, new_figure, styled
 from mampc.report.figures import study_figures
 from mampc.report.inspecting import inspection_figure
 from mampc.study import load_study, run_study

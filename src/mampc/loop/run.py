@@ -100,7 +100,8 @@ class Run:
         Args:
             limits: to be shown too, such as `problem.limits`.
         """
-        from mampc.loop.drawing import BLUE, Look, signals_figure
+        from mampc.base.drawing import BLUE
+        from mampc.loop.drawing import Look, signals_figure
 
         return signals_figure({"closed loop": self}, look={"closed loop": Look(BLUE)}, limits=limits)
 

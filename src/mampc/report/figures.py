@@ -8,22 +8,20 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.compare.sensitivity import Point
-from mampc.identification import IOData, Validation
-from mampc.loop.drawing import (
+from mampc.base.drawing import (
     BLACK,
     BLUE,
     GREY,
     VERMILION,
-    Look,
     legend_above,
-    looks,
     new_figure,
     plain,
-    signals_figure,
     styled,
     time_scale,
 )
+from mampc.compare.sensitivity import Point
+from mampc.identification import IOData, Validation
+from mampc.loop.drawing import Look, looks, signals_figure
 from mampc.loop.run import Run
 from mampc.report.labels import label_points
 from mampc.report.tables import baseline

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table
 
+from mampc.base.drawing import legend_above, new_figure, plain, styled
 from mampc.base.errors import MampcError
 from mampc.base.files import written_whole
 from mampc.compare.fronts import FEWEST, RATIOS, Estimate, Point, error_ratio, moves_at, non_dominated
 from mampc.compare.sweep import points_of
-from mampc.loop.drawing import legend_above, looks, new_figure, plain, styled
+from mampc.loop.drawing import looks
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

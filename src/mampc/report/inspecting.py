@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.base.drawing import BLUE, VERMILION, new_figure, plain, styled, time_scale
 from mampc.identification.export import Inspection
-from mampc.loop.drawing import BLUE, VERMILION, new_figure, plain, styled, time_scale
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

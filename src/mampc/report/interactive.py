@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.base.drawing import time_scale
 from mampc.base.errors import MampcError
-from mampc.loop.drawing import near_limits, time_scale
+from mampc.loop.drawing import near_limits
 from mampc.loop.metrics import Metrics
 from mampc.loop.run import Run
 from mampc.report.figures import result_looks

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from mampc.base.drawing import styled
 from mampc.base.errors import MampcError
 from mampc.base.files import written_whole
-from mampc.loop.drawing import styled
 from mampc.loop.run import Run
 from mampc.report.figures import study_figures
 from mampc.report.folder import ResultFolder
