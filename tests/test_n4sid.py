@@ -304,7 +304,11 @@ def test_stabilising_mirrors_poles_and_says_so():
         (300, {"block_rows": 1}, "block_rows: expected a whole number of at least 2, received 1"),
         (300, {"block_rows": 51}, "block_rows: expected at most 50 for 300 samples, received 51"),
         (300, {"weighting": "best"}, "weighting: expected one of .* received 'best'"),
-        (300, {"unstable": "ignore"}, "unstable: expected 'stabilise' or 'refuse', received 'ignore'"),
+        (
+            300,
+            {"unstable": "ignore"},
+            "unstable: expected 'auto', 'stabilise' or 'refuse', received 'ignore'",
+        ),
     ],
 )
 def test_impossible_requests_are_refused(samples, options, message):

@@ -12,6 +12,7 @@ import numpy as np
 from mampc.base.checks import Array, as_array, as_matrix, as_whole
 from mampc.base.errors import MampcError
 from mampc.identification.arx import estimate_arx
+from mampc.identification.closed_loop import certainly_unstable, estimate_predictor, under_feedback
 from mampc.identification.data import IOData
 from mampc.identification.delays import Integers, find_delays
 from mampc.identification.drift import white_and_walk
@@ -32,6 +33,9 @@ TRENDS = {
     "linear": "a line in time was fitted to each output",
     "differences": "changes were explained, as outputs that drift ask for",
 }
+UNSTABLE = (
+    "The record was taken under feedback and shows poles outside the unit circle for certain; they were kept."
+)
 ENOUGH = 20_000  # samples in which choices are compared
 SHORT = 3  # samples of dead time that are left to the states
 
@@ -99,7 +103,7 @@ def n4sid(
     weighting: str = "cva",
     block_rows: int | None = None,
     feedthrough: bool = True,
-    unstable: str = "stabilise",
+    unstable: str = "auto",
     detrend: str = "auto",
     delays: Any = None,
 ) -> Identified:
@@ -117,7 +121,8 @@ def n4sid(
         block_rows: s, how many samples past and future hold; default 15, less for short records, more
             for a high order.
         feedthrough: False fixes D = 0, as for sampled physical plants.
-        unstable: "stabilise" mirrors poles outside the unit circle to its inside, "refuse" raises.
+        unstable: "stabilise" mirrors poles outside the unit circle to its inside, "refuse" raises; "auto" keeps
+            them where a record taken under feedback shows them for certain, and mirrors them elsewhere.
         detrend: "none" explains the signals as they are, "constant" (beside the means) and "linear" fit a
             constant or a line in time to each output of each record, "differences" explains changes from
             sample to sample; "auto" takes what predicts held-out data best, the simplest if that is alike.
@@ -129,8 +134,8 @@ def n4sid(
     """
     if weighting not in WEIGHTINGS:
         raise MampcError(f"weighting: expected one of {WEIGHTINGS}, received {weighting!r}")
-    if unstable not in ("stabilise", "refuse"):
-        raise MampcError(f"unstable: expected 'stabilise' or 'refuse', received {unstable!r}")
+    if unstable not in ("auto", "stabilise", "refuse"):
+        raise MampcError(f"unstable: expected 'auto', 'stabilise' or 'refuse', received {unstable!r}")
     if detrend not in DETREND:
         raise MampcError(f"detrend: expected one of {DETREND}, received {detrend!r}")
     given = _records(data)
@@ -141,10 +146,16 @@ def n4sid(
     records = scaled(given, centred=detrend != "none")
     settings = Settings(order, weighting, s, feedthrough, unstable)
     dead = _given_delays(delays, l, m, min(lengths))
-    choice = _chosen(records, settings, detrend, dead)
     values: list[Array] = []
-    parts = _parts(records, settings, choice, values)
-    model = replace(assembled(parts, records, first), noise=_noise(parts, records))
+    if unstable == "auto" and detrend != "none" and dead is None and _keeps_unstable(records, settings):
+        choice = _Choice("constant", np.zeros((l, m), dtype=int), predictor=True, notes=(UNSTABLE,))
+        part, errors_ahead = estimate_predictor(records, feedthrough, order)
+        parts, noise = [part], Noise(errors_ahead * records.y_spread, np.zeros(l))
+    else:
+        choice = _chosen(records, settings, detrend, dead)
+        parts = _parts(records, settings, choice, values)
+        noise = _noise(parts, records)
+    model = replace(assembled(parts, records, first), noise=noise)
     integrators = sum(part.integrators for part in parts)
     notes = list(choice.notes)
     if integrators:
@@ -167,11 +178,12 @@ def n4sid(
 
 @dataclass(frozen=True)
 class _Choice:
-    """What is estimated: the trend, the dead times (l, m), and whether the rival's poles are taken."""
+    """What is estimated: the trend, the dead times (l, m), and whether by the rival or from predictors."""
 
     trend: str
     delays: Integers
     rival: bool = False
+    predictor: bool = False
     notes: tuple[str, ...] = ()
 
 
@@ -201,6 +213,15 @@ class _Estimate:
         return assembled(parts, records, self.like).step_response(samples)
 
 
+def _keeps_unstable(records: Scaled, settings: Settings) -> bool:
+    """Whether a record under feedback shows poles outside the unit circle for certain."""
+    try:
+        few = records.shortened(ENOUGH)
+        return under_feedback(few) and certainly_unstable(few, settings.feedthrough, settings.order)
+    except np.linalg.LinAlgError:
+        return False
+
+
 def _noise(parts: Sequence[Part], records: Scaled) -> Noise:
     """White noise and random walk in what the parts leave, in output units."""
     output, drift = np.zeros((2, len(records.y_spread)))
@@ -218,6 +239,8 @@ def _parts(
     orders: Sequence[int] | None = None,
 ) -> list[Part]:
     """The parts of a model, of given orders if any; appends the singular values of each."""
+    if choice.predictor:
+        return [estimate_predictor(records, settings.feedthrough, None if orders is None else orders[0])[0]]
     if choice.rival:
         return estimate_arx(records, choice.delays, settings, choice.trend, orders)
     parts = []

@@ -9,9 +9,13 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
-from mampc.identification.simulation_error import filtered
+from mampc.identification.simulation_error import filtered, states
 from mampc.identification.triangular import fold, solve
+from mampc.systems.riccati import predicted_covariance
 from mampc.systems.state_space import StateSpace
+
+RUNAWAY = 7.0  # logarithm of the growth over a record beyond which a model is not simulated
+NEGLIGIBLE = 1e-4  # disturbance of the states beside the inputs'
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +41,9 @@ class Validation:
 def validate(model: StateSpace, data: IOData, *, drift: bool = False) -> Validation:
     """Simulate the model over a record, without feedback of its outputs.
 
+    An unstable model, whose simulation would run away, predicts one sample ahead instead, with the least
+    correction by past outputs that keeps it stable (which mirrors its unstable poles).
+
     The outputs serve only to fit the initial state by least squares, and with `drift` a line in time at each
     output, which y_hat then contains and about which the fit is measured.
 
@@ -50,8 +57,12 @@ def validate(model: StateSpace, data: IOData, *, drift: bool = False) -> Validat
             f"validate: expected {model.B.shape[1]} inputs and {model.n_outputs} outputs, "
             f"received {data.u.shape[1]} and {data.y.shape[1]}"
         )
-    x0, line = initial_state(model, data, drift=drift)
-    y_hat = model.response(data.u, x0) + line
+    if _runs_away(model, len(data)):
+        x0, y_hat = _predicted(model, data)
+        line = np.zeros_like(y_hat)
+    else:
+        x0, line = initial_state(model, data, drift=drift)
+        y_hat = model.response(data.u, x0) + line
     residuals = data.y - y_hat
     own = _lines(len(data)) if drift else np.empty((len(data), 0))
     level = own @ (own.T @ data.y)
@@ -92,6 +103,30 @@ def initial_state(model: StateSpace, data: IOData, *, drift: bool = False) -> tu
         start += len(free)
     solution = solve(factor)
     return solution[:n], lines @ solution[n:].reshape(-1, l) * spread
+
+
+def _runs_away(model: StateSpace, samples: int) -> bool:
+    growth = np.abs(model.poles()).max(initial=0.0)
+    return bool(growth > 1.0 and samples * np.log(growth) > RUNAWAY)
+
+
+def _predicted(model: StateSpace, data: IOData) -> tuple[Array, Array]:
+    """The initial state, shape (n,), and one-step predictions, shape (N, l)."""
+    spread = data.y.std(axis=0)
+    spread[spread == 0.0] = 1.0
+    A, C = model.A, model.C / spread[:, None]
+    unit = np.linalg.norm(model.B * data.u.std(axis=0), axis=1)
+    Q = np.diag((NEGLIGIBLE * (unit + NEGLIGIBLE * unit.max(initial=1e-300))) ** 2)
+    P = predicted_covariance(A, C, Q, np.eye(len(C)))
+    K = A @ np.linalg.solve(C @ P @ C.T + np.eye(len(C)), C @ P).T
+    predictor, du = A - K @ C, data.u - model.all_inputs_op
+    direct = (data.y - model.y_op) / spread - du @ (model.D / spread[:, None]).T
+    explained = states(predictor, du @ model.B.T + direct @ K.T, np.zeros(len(A))) @ C.T
+    impulse = np.zeros((len(data), 1))
+    impulse[0] = 1.0
+    free = np.concatenate(list(filtered(predictor, C, impulse)))[..., 0]
+    x0 = np.linalg.lstsq(free.reshape(-1, len(A)), (direct - explained).reshape(-1))[0]
+    return x0, data.y - (direct - explained - free @ x0) * spread
 
 
 def _lines(samples: int) -> Array:

@@ -1,0 +1,158 @@
+"""Unstable plants, recorded under feedback: dynamics and inputs from one-step predictors.
+
+A long vector ARX model predicts without bias under feedback too. Its coefficients are the Markov parameters of the
+predictor x+ = (A - K C) x + (B - K D) u + K y, whose realisation gives A, C and K. B, D, initial states and constants
+then minimise the prediction error, which stays finite whatever the poles of A.
+
+Sources: Jansson, Subspace identification and ARX modeling, SYSID (2003); Chiuso, Automatica 43 (2007) (predictor-based
+subspace identification).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.identification.parts import Part
+from mampc.identification.scaling import Scaled
+from mampc.identification.simulation_error import Trend, fit_inputs, residuals, states
+from mampc.identification.triangular import fold, solve
+
+PAST = 20  # coefficients of every signal, at most
+FEEDBACK = 5.0  # standard deviations by which past outputs must explain inputs better than chance
+OUTSIDE = 3.0  # standard deviations by which a pole must lie outside the unit circle
+SEGMENTS = 8
+MOST = 8  # states
+
+
+def under_feedback(records: Scaled) -> bool:
+    """Whether past outputs say something of the inputs beside their own past: a likelihood ratio test."""
+    lags = _lags(records)
+    m, l = records.u[0].shape[1], records.y[0].shape[1]
+    factor = _regression(records.u, records.y, lags, target="u", feedthrough=False)
+    size = lags * (m + l)
+    whole = factor[size:, size:]
+    without = fold(np.empty((0, lags * m + m)), np.delete(factor, np.s_[lags * m : size], axis=1))[
+        lags * m :, lags * m :
+    ]
+    N = sum(len(u) - lags for u in records.u)
+    gain = 0.0
+    for j in range(m):
+        less, more = np.linalg.norm(whole[:, j]), np.linalg.norm(without[:, j])
+        if less > 1e-9 * np.sqrt(N):
+            gain += 2 * N * np.log(more / less)
+    chance = m * l * lags
+    return bool(gain > chance + FEEDBACK * np.sqrt(2 * chance))
+
+
+def certainly_unstable(records: Scaled, feedthrough: bool, order: int | None) -> bool:
+    """Whether poles lie outside the unit circle by more than what leaving out parts of the records changes."""
+    A, _, _, n = _dynamics(records, feedthrough, order)
+    size = np.abs(np.linalg.eigvals(A)).max()
+    if size <= 1.0:
+        return False
+    sizes = []
+    for left_out in range(SEGMENTS):
+        rest = _without(records, left_out)
+        sizes.append(np.abs(np.linalg.eigvals(_dynamics(rest, feedthrough, n)[0])).max())
+    spread = np.sqrt((SEGMENTS - 1) / SEGMENTS * np.sum((np.array(sizes) - np.mean(sizes)) ** 2))
+    return bool(size - 1.0 > OUTSIDE * spread)
+
+
+def estimate_predictor(records: Scaled, feedthrough: bool, order: int | None) -> tuple[Part, Array]:
+    """The part of all outputs that predicts them best one sample ahead, and its prediction errors' sizes (l,)."""
+    A, C, K, _ = _dynamics(records, feedthrough, order)
+    return _predicted(A, C, K, records, feedthrough)
+
+
+def _predicted(A: Array, C: Array, K: Array, records: Scaled, feedthrough: bool) -> tuple[Part, Array]:
+    """With B, D and trends that minimise the prediction error."""
+    predictor, l = A - K @ C, len(C)
+    innovations = [y - states(predictor, y @ K.T, np.zeros(len(A))) @ C.T for y in records.y]
+    explained = records.replaced(records.u, innovations)
+    fit = fit_inputs(predictor, C, explained, feedthrough=feedthrough, degree=0)
+    sizes = np.concatenate(residuals(predictor, C, fit, explained)).std(axis=0)
+    seen = np.eye(l) - C @ np.linalg.solve(np.eye(len(A)) - predictor, K)  # of a constant, in the innovations
+    trends = [Trend(t.x0, np.linalg.lstsq(seen, t.polynomial.T)[0].T, t.drive) for t in fit.trends]
+    fit = fit._replace(B=fit.B + K @ fit.D, trends=trends)
+    delays = np.zeros(records.u[0].shape[1], dtype=int)
+    return Part(tuple(range(l)), delays, A, C, 0, False, fit), sizes
+
+
+def _dynamics(records: Scaled, feedthrough: bool, order: int | None) -> tuple[Array, Array, Array, int]:
+    """A, C, K and the order, from the Hankel matrix of the predictor's Markov parameters."""
+    m, l, lags = records.u[0].shape[1], records.y[0].shape[1], _lags(records)
+    factor = _regression(records.u, records.y, lags, target="y", feedthrough=feedthrough)
+    size = factor.shape[1] - l
+    theta = np.column_stack(
+        [solve(np.column_stack([factor[:, :size], factor[:, size + i]])) for i in range(l)]
+    )
+    own = theta[: lags * (m + l)]
+    blocks = np.concatenate(
+        [own[: lags * m].reshape(lags, m, l), own[lags * m :].reshape(lags, l, l)], axis=1
+    )
+    markov = blocks.transpose(0, 2, 1)  # (lags, l, m + l): C (A - K C)^i [B - K D, K]
+    rows = lags // 2 + 1
+    zero = np.zeros_like(markov[0])
+    hankel = np.block([[markov[i + j] if i + j < lags else zero for j in range(lags)] for i in range(rows)])
+    past = [lag * (m + l) + j for lag in range(lags) for j in range(m)]
+    past += [lag * (m + l) + m + j for lag in range(lags) for j in range(l)]
+    left, values, _ = np.linalg.svd(hankel[:, past] @ factor[: lags * (m + l), : lags * (m + l)].T)
+    most = min(MOST, len(values) - l)
+    found = {}
+    for n in [order] if order is not None else range(1, most + 1):
+        gamma = left[:, :n]
+        delta = gamma.T @ hankel
+        predictor, C, K = np.linalg.lstsq(gamma[:-l], gamma[l:])[0], gamma[:l], delta[:, m : m + l]
+        found[n] = (predictor + K @ C, C, K, n)
+    if len(found) == 1:
+        return next(iter(found.values()))
+    N = records.samples
+
+    def information(n: int) -> float:
+        """Schwarz's criterion."""
+        A, C, K, _ = found[n]
+        if np.abs(np.linalg.eigvals(A - K @ C)).max() >= 1.0:
+            return np.inf
+        error = _predicted(A, C, K, records, feedthrough)[0].fit.error
+        return float(l * N * np.log(max(error, 1e-9) ** 2) + n * (m + 2 * l) * np.log(l * N))
+
+    return found[min(found, key=information)]
+
+
+def _lags(records: Scaled) -> int:
+    m, l = records.u[0].shape[1], records.y[0].shape[1]
+    return int(max(2, min(PAST, records.samples // (10 * (m + l)))))
+
+
+def _regression(
+    u: Sequence[Array], y: Sequence[Array], lags: int, *, target: str, feedthrough: bool
+) -> Array:
+    """The triangular factor of past inputs, past outputs (the present inputs) and the target."""
+    factor: Array = np.empty((0, 0))
+    for inputs, outputs in zip(u, y, strict=True):
+        N = len(inputs) - lags
+        if N <= 1:
+            continue
+        past = [signal[lags - i : lags - i + N] for signal in (inputs, outputs) for i in range(1, lags + 1)]
+        now = [inputs[lags:]] if feedthrough else []
+        rows = np.concatenate(
+            [np.ones((N, 1)), *past, *now, (inputs if target == "u" else outputs)[lags:]], axis=1
+        )
+        reduced = fold(np.empty((0, rows.shape[1])), rows)[1:, 1:]
+        factor = fold(factor if factor.size else np.empty((0, reduced.shape[1])), reduced)
+    return factor
+
+
+def _without(records: Scaled, left_out: int) -> Scaled:
+    """The records without one of the segments of each."""
+    u: list[Array] = []
+    y: list[Array] = []
+    for inputs, outputs in zip(records.u, records.y, strict=True):
+        cuts = [round(k * len(inputs) / SEGMENTS) for k in (left_out, left_out + 1)]
+        for side in (slice(0, cuts[0]), slice(cuts[1], None)):
+            u.append(inputs[side])
+            y.append(outputs[side])
+    return records.replaced(u, y)
