@@ -431,10 +431,45 @@ def test_rows_swallowed_by_a_quotation_mark_are_noticed(tmp_path):
 
 
 def test_missing_columns_are_all_named_with_a_guess(tmp_path):
-    with pytest.raises(MampcError, match="2 things") as refusal:
+    with pytest.raises(MampcError) as refusal:
         read(tmp_path, text(rows(), header=("time", "Valve", "Level")), inputs="valve", outputs="Levl")
-    assert "'valve', received columns ['time', 'Valve', 'Level']; did you mean 'Valve'?" in str(refusal.value)
-    assert "did you mean 'Level'?" in str(refusal.value)
+    assert "'valve' and one 'Levl', received columns ['time', 'Valve', 'Level']" in str(refusal.value)
+    assert "did you mean 'Valve' for 'valve'?; did you mean 'Level' for 'Levl'?" in str(refusal.value)
+
+
+def test_tags_in_rows_are_told_from_missing_columns(tmp_path):
+    lines = [[time, tag, value] for time, u, y in rows() for tag, value in (("u", u), ("y", y))]
+    with pytest.raises(MampcError, match="they stand in its rows: save one column a signal"):
+        read(tmp_path, text(lines, header=("time", "tag", "value")))
+
+
+def test_a_column_of_times_for_each_signal_counts_only_where_all_are_the_same(tmp_path):
+    lines = [[time, u, time, y] for time, u, y in rows()]
+    assert_whole(read(tmp_path, text(lines, header=("time", "u", "time", "y"))))
+    lines[6][2] = lines[6][2][:-2] + "30"
+    with pytest.raises(MampcError, match="expected one column of times"):
+        read(tmp_path, text(lines, header=("time", "u", "time", "y")))
+
+
+def test_a_negative_mark_among_large_positive_values(tmp_path):
+    y = np.where(np.arange(len(U)) == 5, -9999.0, 1e4 * np.arange(len(U)))
+    assert [len(record) for record in read(tmp_path, text(rows(y=y))).records] == [5, 6]
+
+
+@pytest.mark.parametrize("column", [1, 2])
+def test_short_gaps_are_closed_only_where_asked_and_told(tmp_path, column):
+    lines = rows(u=np.arange(12.0), y=2 * np.arange(12.0))
+    lines[3][column] = lines[4][column] = "Bad"
+    del lines[8]
+    assert [len(record) for record in read(tmp_path, text(lines)).records] == [3, 3, 3]
+    assert [len(record) for record in read(tmp_path, text(lines), fill=1).records] == [3, 7]
+    export = read(tmp_path, text(lines), fill=2)
+    [record] = export.records
+    np.testing.assert_allclose(record.y[:, 0], 2 * np.arange(12.0))
+    held = np.array([0, 1, 2, *((2, 2) if column == 1 else (3, 4)), 5, 6, 7, 7, 9, 10, 11.0])
+    np.testing.assert_allclose(record.u[:, 0], held)
+    assert told(export, f"{'uy'[column - 1]}: 2 missing values put in")
+    assert told(export, "1 gap of up to 2 samples closed, after row 9")
 
 
 @pytest.mark.parametrize(
@@ -447,6 +482,7 @@ def test_missing_columns_are_all_named_with_a_guess(tmp_path):
         ({"time_format": "%d.%m.%Y"}, "expected times in column 'time'"),
         ({"ranges": {"z": (0, 1)}}, "ranges: expected names among"),
         ({"ranges": {"u": (1, 0)}}, "expected the lowest value first"),
+        ({"fill": -1}, "fill: expected a whole number"),
         ({"ranges": {"u": 5}}, "expected a lowest and a highest value"),
     ],
 )

@@ -35,6 +35,12 @@ Ranges = Annotated[
     list[str] | None,
     typer.Option("--range", help="Lowest and highest believable value, COLUMN=LOW:HIGH; repeat it."),
 ]
+Fill = Annotated[
+    int,
+    typer.Option(
+        help="Make up as many samples in a row where they are missing: inputs held, outputs on lines."
+    ),
+]
 
 
 @app.command()
@@ -52,6 +58,7 @@ def inspect(
     bad: Bad = None,
     good: Good = None,
     ranges: Ranges = None,
+    fill: Fill = 0,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Picture; default NAME-columns.png beside the file.")
     ] = None,
@@ -72,7 +79,7 @@ def inspect(
     from mampc.report.output import save_figure
 
     reading = _reading(
-        inputs, outputs, disturbances, ranges, bad, good, dt=dt,
+        inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
     )  # fmt: skip
     target = export.parent / f"{export.stem}-columns.png" if out is None else out
@@ -118,6 +125,7 @@ def identify(
     bad: Bad = None,
     good: Good = None,
     ranges: Ranges = None,
+    fill: Fill = 0,
     order: Annotated[int | None, typer.Option(help="Model order; default from the singular values.")] = None,
     weighting: Annotated[str, typer.Option(help="cva, n4sid or moesp.")] = "cva",
     block_rows: Annotated[
@@ -154,7 +162,7 @@ def identify(
 
     target = exports[0].parent / f"{exports[0].stem}.json" if out is None else out
     reading = _reading(
-        inputs, outputs, disturbances, ranges, bad, good, dt=dt,
+        inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
     )  # fmt: skip
     settings = {
@@ -199,16 +207,6 @@ def _reading(
         except ValueError:
             raise MampcError(f"--range: expected COLUMN=LOW:HIGH, received {text!r}") from None
     return words | plain | {"bad": bad or (), "good": good or (), "ranges": limits}
-
-
-def _is_model(path: Path) -> bool:
-    from mampc.systems.state_space import StateSpace
-
-    try:
-        StateSpace.load(path)
-    except MampcError:
-        return False
-    return True
 
 
 def _words(text: str) -> list[str]:

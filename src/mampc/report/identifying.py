@@ -11,11 +11,13 @@ from typing import Any
 from mampc.base.checks import as_number
 from mampc.base.errors import MampcError
 from mampc.identification import Identified, IOData, Validation, n4sid, read_export
+from mampc.identification.export.findings import counted
 from mampc.report.figures import validation_figure
 from mampc.report.output import save_figure
 
 POOR_FIT = 40.0  # percent; a model below it is hardly one to control with
 SHORTEST = 10  # samples on either side of a cut
+SHORT = 30  # samples: a piece with fewer has neither past nor future for the usual 15 block rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ def identify_and_write(
         records += export.records
         notes += [f"{path}: {note}" if len(exports) > 1 else note for note in export.notes]
     require_writable(target)
-    estimation, rest = hold_out(records, share)
+    estimation, rest = hold_out(long_enough(records, notes), share)
     show("identifying a model")
     identified = n4sid(estimation if len(estimation) > 1 else estimation[0], **settings)
     validation = identified.validate(rest)
@@ -86,6 +88,20 @@ def identify_and_write(
     except MampcError as error:
         warnings.append(f"no figure written; {error}")
     return Outcome(identified, validation, tuple(notes), tuple(warnings), tuple(map(len, estimation)))
+
+
+def long_enough(records: Sequence[IOData], notes: list[str]) -> Sequence[IOData]:
+    """The records that say more than where they begin, if they are most of the samples; a note tells of the others."""
+    kept = [record for record in records if len(record) >= SHORT]
+    samples, left = sum(map(len, records)), sum(map(len, kept))
+    if len(kept) == len(records):
+        return records
+    lost = f"{counted(len(records) - len(kept), 'piece')} of fewer than {SHORT} samples, {samples - left} of {samples}"
+    if left < samples / 2:
+        notes.append(f"{lost}, say little; --fill closes short gaps")
+        return records
+    notes.append(f"{lost}, left out of the identification; --fill closes short gaps")
+    return kept
 
 
 def hold_out(records: Sequence[IOData], share: float) -> tuple[list[IOData], IOData]:

@@ -13,7 +13,7 @@ from mampc.base.checks import Array
 from mampc.base.errors import shown
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.numbers import POINT, clean, is_number, numeric_share
-from mampc.identification.export.sheet import Sheet, find_column
+from mampc.identification.export.sheet import Cells, Sheet, find_column
 from mampc.identification.export.stamps import (
     DATE_ONLY,
     SECONDS,
@@ -160,11 +160,9 @@ def _time_columns(
         )
     ]
     found = stamps or [*dates, *hours] or numeric
-    exact = [at for at in found if sheet.header[at].casefold() in EXACT]
-    if len(found) > 1 and len(exact) == 1:
-        findings.note(f"times taken from column {sheet.header[exact[0]]!r}; there are other columns of times")
-        return (exact[0],)
-    if len(found) > 1:
+    if len(found) > 1 and _all_alike([sheet.column(at) for at in found]):
+        findings.note(f"{len(found)} columns of times are the same, as {sheet.header[found[0]]!r}")
+    elif len(found) > 1:
         listed = ", ".join(repr(sheet.header[at]) for at in found)
         findings.doubt(
             f"expected one column of times, received {listed}; say which one counts (time, --time)"
@@ -172,6 +170,10 @@ def _time_columns(
     if not found and free[:1] == [0] and _runs_on(sheet, 0, 0.9, evenly=True):
         return (0,)
     return tuple(found[:1])
+
+
+def _all_alike(columns: Sequence[Cells]) -> bool:
+    return all(list(column) == list(columns[0]) for column in columns[1:])
 
 
 def _sampled(sheet: Sheet, at: int) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,8 @@ def make_grid(
         findings: receives notes and doubts.
     """
     if clock is None:
+        if dt is None and findings.doubts:
+            return None
         if dt is None:
             findings.doubt(
                 "expected a column of times; name it (time, --time), or pass the sample time (dt, --dt)"
@@ -57,6 +60,8 @@ def make_grid(
         return Grid(dt, np.arange(len(values)), np.arange(len(values)) * dt)
     order = _in_order(clock, numbers, findings)
     order = _each_once(order, clock.seconds, values, numbers, findings)
+    if any("more than once" in doubt for doubt in findings.doubts):
+        return None
     seconds = clock.seconds[order]
     if len(seconds) < 2:
         findings.doubt(f"expected an evenly increasing time column, received {len(seconds)} different times")
@@ -77,15 +82,54 @@ def make_grid(
     return Grid(found if dt is None else dt, order, seconds)
 
 
+def bridged(
+    grid: Grid, values: Array, inputs: int, fill: int, names: Sequence[str], findings: Findings
+) -> Array:
+    """Rows in order, with up to `fill` missing values in a row of a column put in.
+
+    The first columns are inputs, which keep their value; the others lie on a line between their neighbours.
+    """
+    values = values.copy()
+    for j, column in enumerate(values.T):
+        known = np.flatnonzero(~np.isnan(column))
+        holes = np.flatnonzero(np.diff(known) > 1)
+        short = np.diff(grid.seconds[known])[holes] <= (fill + GAP) * grid.dt
+        short &= np.diff(known)[holes] <= fill + 1
+        put = np.concatenate(
+            [np.arange(known[h] + 1, known[h + 1]) for h in holes[short]] or [np.empty(0, dtype=np.int64)]
+        )
+        if not len(put):
+            continue
+        if j < inputs:
+            column[put] = column[known[np.searchsorted(known, put) - 1]]
+        else:
+            column[put] = np.interp(grid.seconds[put], grid.seconds[known], column[known])
+        how = "the one before" if j < inputs else "on a line between its neighbours"
+        findings.change(f"{names[j]}: {counted(len(put), 'missing value')} put in, each {how}")
+    return values
+
+
 def pieces(
-    grid: Grid, clock: Clock | None, usable: BoolArray, numbers: npt.NDArray[np.int64], findings: Findings
+    grid: Grid,
+    clock: Clock | None,
+    usable: BoolArray,
+    numbers: npt.NDArray[np.int64],
+    findings: Findings,
+    fill: int = 0,
 ) -> list[npt.NDArray[np.int64]]:
-    """Positions in the grid of runs of usable rows without a gap in time, one sample each or longer."""
+    """Positions in the grid of runs of usable rows without a gap in time of more than `fill` samples."""
     kept = np.flatnonzero(usable)
     if not kept.size:
         return []
     seconds = grid.seconds[kept]
-    cuts = np.flatnonzero(np.diff(seconds) > GAP * grid.dt)
+    steps = np.diff(seconds) / grid.dt
+    cuts = np.flatnonzero(steps > fill + GAP)
+    closed = np.flatnonzero((steps > GAP) & (steps <= fill + GAP))
+    if len(closed):
+        rows = rows_text(numbers[grid.order[kept[closed]]].tolist())
+        findings.change(
+            f"{counted(len(closed), 'gap')} of up to {counted(fill, 'sample')} closed, after {rows}"
+        )
     if len(cuts):
         lines = []
         for cut in cuts[:MOST_SHOWN]:

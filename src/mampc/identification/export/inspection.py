@@ -130,7 +130,8 @@ def inspect_export(
         usable = (
             np.asarray(~np.isnan(values[order]).any(axis=1)) if wanted else np.ones(len(order), dtype=bool)
         )
-        lengths = tuple(len(piece) for piece in pieces(grid, clock, usable, sheet.numbers, findings))
+        fill = options.get("fill", 0)
+        lengths = tuple(len(piece) for piece in pieces(grid, clock, usable, sheet.numbers, findings, fill))
     elif clock is not None:
         order = np.argsort(clock.seconds, kind="stable")[: np.count_nonzero(~np.isnan(clock.seconds))]
         seconds = clock.seconds[order]

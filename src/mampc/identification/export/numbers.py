@@ -24,7 +24,8 @@ DIGIT = re.compile(r"\d")
 MARK = re.compile(
     r"#|\b(bad|no ?data|no ?good|err(or)?|fail(ed|ure)?|invalid|time ?out|null|nan)\b", re.IGNORECASE
 )
-# Numbers that programs write in the place of a value: they count as marks only far from all other values.
+# Numbers that programs write in the place of a value: they count as marks only far from all other
+# values, or below zero where no other value is.
 MARKS = [
     *(sign * float(nines) for nines in ("999", "9999", "99999", "999999", "9999999") for sign in (1, -1)),
     999.25, -999.25, 32767.0, -32768.0, 65535.0, -32767.0, 2147483647.0, -2147483648.0, 4294967295.0,
@@ -210,7 +211,7 @@ class _Reader:
         least, most = float(others.min()), float(others.max())
         for mark in np.unique(values[suspect]):
             distance = max(least - mark, mark - most)
-            if distance > most - least:
+            if distance > most - least or mark < 0 <= least:
                 self._drop(values == mark, rows)
             elif distance > 0:
                 findings.doubt(

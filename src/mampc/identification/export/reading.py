@@ -11,13 +11,13 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 import numpy as np
 import numpy.typing as npt
 
-from mampc.base.checks import Array, as_number
+from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.identification.data import IOData
 from mampc.identification.export.clock import Clock, read_clock
 from mampc.identification.export.findings import Findings, counted
-from mampc.identification.export.grid import STRAYING, Grid, make_grid, pieces, resampled
+from mampc.identification.export.grid import STRAYING, Grid, bridged, make_grid, pieces, resampled
 from mampc.identification.export.numbers import Reading, read_numbers
 from mampc.identification.export.quality import drop_bad_quality, quality_columns
 from mampc.identification.export.sheet import find_column, open_sheet
@@ -35,6 +35,8 @@ class ReadingOptions(TypedDict, total=False):
     bad: further words and numbers that stand in the place of a missing value.
     good: words of quality columns that mean a good value.
     ranges: lowest and highest believable value of columns, {"TI101": (0.0, 200.0)}.
+    fill: up to so many samples in a row may be made up where they are missing: inputs are held, outputs lie on lines;
+        default none.
     """
 
     time: str | None
@@ -45,6 +47,7 @@ class ReadingOptions(TypedDict, total=False):
     bad: Sequence[str]
     good: Sequence[str]
     ranges: Mapping[str, tuple[float, float]]
+    fill: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +103,13 @@ def read_export(
     if dt is not None:
         dt = as_number("dt", dt, 0.0, exclusive=True)
     how, reading = readings(options, wanted)
+    fill = as_whole("fill", options.get("fill", 0), 0)
 
     table = _read_table(source, names, how, reading, listed(options.get("good", ())), findings)
     grid = make_grid(table.clock, table.values, table.numbers, dt, findings)
     findings.require_none()
     assert grid is not None  # else there is a doubt
-    records, starts = _cut(table, grid, findings)
+    records, starts = _cut(table, grid, fill, findings)
     if not records:
         raise MampcError(f"{origin}: expected consecutive rows with a number in every column, received none")
     return Export(tuple(records), tuple(findings.notes), tuple(findings.changes), tuple(starts))
@@ -143,16 +147,20 @@ def _read_table(
     return _Table(replace(names, units=units), clock, values, sheet.numbers)
 
 
-def _cut(table: _Table, grid: Grid, findings: Findings) -> tuple[list[IOData], list[str]]:
+def _cut(table: _Table, grid: Grid, fill: int, findings: Findings) -> tuple[list[IOData], list[str]]:
     """A record for each piece without a gap, and when it begins."""
     names, clock, _, numbers = table
     values = table.values
     if not np.array_equal(grid.order, np.arange(len(values))):
         values = values[grid.order]
-    usable = np.asarray(np.isfinite(values).all(axis=1))
     m, d = len(names.inputs), len(names.disturbances)
+    if fill:
+        values = bridged(
+            grid, values, m, fill, (*names.inputs, *names.disturbances, *names.outputs), findings
+        )
+    usable = np.asarray(np.isfinite(values).all(axis=1))
     records, starts, strays, short = [], [], 0.0, 0
-    for piece in pieces(grid, clock, usable, numbers, findings):
+    for piece in pieces(grid, clock, usable, numbers, findings, fill):
         whole = len(piece) == piece[-1] - piece[0] + 1  # rows beside each other are not copied
         rows = slice(piece[0], piece[-1] + 1) if whole else piece
         held, changing, straying = resampled(grid.seconds[rows], values[rows, :m], values[rows, m:], grid.dt)

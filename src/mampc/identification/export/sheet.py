@@ -7,7 +7,7 @@ import difflib
 import io
 import re
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
@@ -177,7 +177,7 @@ def _row_sheet(
             f"{shown(' '.join(cell for cell in head[0][1] if cell))}"
         )
     if names:
-        require_columns(header, names, findings)
+        require_columns(header, names, findings, {cell for _, row in head[at:] for cell in row})
     return _measured(rows, separator, header_number, header, names, findings)
 
 
@@ -337,11 +337,24 @@ def header_units(header: Sequence[str]) -> dict[int, str]:
     return {at: match.group(1) for at, match in found.items() if match}
 
 
-def require_columns(header: Sequence[str], names: Sequence[str], findings: Findings) -> None:
+def require_columns(
+    header: Sequence[str], names: Sequence[str], findings: Findings, cells: Collection[str] = ()
+) -> None:
+    """Raise `MampcError` unless each name stands once in the header; `cells` are some of those under it."""
     missing = [name for name in names if find_column(header, name) is None]
-    for name in missing:
-        close = difflib.get_close_matches(name, header, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close and close[0] != name else ""
-        findings.doubt(f"expected one column {name!r}, received columns {shown(list(header), 400)}{hint}")
-    if missing:
-        findings.require_none()
+    if not missing:
+        return
+    alike = {word.casefold(): word for word in header}
+    guesses = {
+        name: alike.get(name.casefold()) or next(iter(difflib.get_close_matches(name, header, n=1)), None)
+        for name in missing
+        if name not in header
+    }
+    hints = [f"did you mean {guess!r} for {name!r}?" for name, guess in guesses.items() if guess]
+    if all(name in cells for name in missing):
+        hints.append("they stand in its rows: save one column a signal, as a pivot table does")
+    wanted = " and one ".join(repr(name) for name in missing)
+    findings.doubt(
+        "; ".join([f"expected one column {wanted}, received columns {shown(list(header), 400)}", *hints])
+    )
+    findings.require_none()
