@@ -1,7 +1,6 @@
 """The alternating minimisation is the paper's Algorithm 1, and its options do what they say."""
 
 import copy
-import dataclasses
 import pickle
 from functools import cache
 
@@ -255,7 +254,7 @@ def test_the_next_sample_starts_from_the_shifted_pattern():
     np.testing.assert_array_equal(decision.state.guess, np.vstack([kept[1:], np.zeros(2)]))
     controller = ours(problem, rules, tolerance=1e-10, max_iterations=10_000)
     settled = decide(controller, past, x, reference)
-    state = dataclasses.replace(controller.initial_state(past), guess=kept)
+    state = controller.initial_state(past)._replace(guess=kept)
     assert controller.step(state, x, reference).iterations < settled.iterations
 
 

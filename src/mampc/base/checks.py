@@ -19,7 +19,7 @@ LARGEST = 1e12  # in engineering units; beyond it a number is a fault, and doubl
 
 
 def is_usable(vector: Array) -> bool:
-    """Whether all entries are numbers below `LARGEST` in size; never warns."""
+    """Whether all entries of a vector are numbers below `LARGEST` in size; never warns."""
     return not vector.size or bool(vector[vector.argmin()] > -LARGEST and vector[vector.argmax()] < LARGEST)
 
 

@@ -72,6 +72,8 @@ class Controller(ABC):
         self._resolution = SAME * self.condensed.input_prefix
         self._no_violations = np.zeros(model.n_outputs)
         self._unknown_violations = np.full(model.n_outputs, np.nan)
+        for constant in (self._resolution, self._no_violations, self._unknown_violations):
+            constant.setflags(write=False)
         self._shape = (problem.control_horizon, model.n_inputs)
         self._memory = 1
         self._x_shape = (model.n_states,)
@@ -233,26 +235,33 @@ class Controller(ABC):
         self, plan: Plan, moves: Array, sample: Sample, state: ControllerState, inputs: InputRange
     ) -> Plan:
         """The plan with its inputs, objective and violations, which all belong to the same moves."""
-        status, lower_bound, objective = plan.status, plan.lower_bound, plan.objective
-        changes, planned = moves.reshape(self._shape), plan.inputs
+        status, lower_bound, objective, violations = (
+            plan.status, plan.lower_bound, plan.objective, plan.violations
+        )  # fmt: skip
+        changes, planned, applied = moves.reshape(self._shape), plan.inputs, state.inputs[-1:]
         if planned is None:
             if self._du_max is not None:
                 changes = np.minimum(np.maximum(changes, -self._du_max), self._du_max)
             # Sums in this order leave an input that does not move exactly where it was.
-            planned = np.concatenate((state.inputs[-1:], changes)).cumsum(axis=0)[1:]
+            planned = np.concatenate((applied, changes)).cumsum(axis=0)[1:]
         planned = planned.reshape(self._shape)
         kept = inputs.clipped(planned)
-        if (np.abs(kept - planned) > self._resolution + ROUNDED * np.abs(planned)).any():
+        clipped = kept - planned
+        if clipped.any() and (np.abs(clipped) > self._resolution + ROUNDED * np.abs(planned)).any():
             # Planned beyond what counts as a number: this is another plan, of which nothing is proven.
-            changes = np.diff(kept, axis=0, prepend=state.inputs[-1:])
-            status, lower_bound, objective = Status.FEASIBLE, -np.inf, None
+            changes = np.diff(kept, axis=0, prepend=applied)
+            status, lower_bound, objective, violations = Status.FEASIBLE, -np.inf, None, None
         moves = changes.ravel()
         if objective is None:
             objective = self.condensed.cost(sample, moves) + self._charge(moves)
-        violations = self.condensed.violations(sample, moves) if self.condensed.n_violations else None
-        return plan._replace(
-            moves=moves, status=status, lower_bound=lower_bound, inputs=kept, objective=objective,
-            violations=violations,
+        if violations is None and self.condensed.n_violations:
+            violations = self.condensed.violations(sample, moves)
+        for array in (changes, kept, violations):
+            if array is not None:
+                array.setflags(write=False)
+        return Plan(
+            moves, status, plan.iterations, lower_bound, plan.guess, kept, objective, plan.remarks, plan.active,
+            plan.memory, violations,
         )  # fmt: skip
 
     def _to_hold(self, plan: Plan, sample: Sample | None, state: ControllerState, inputs: InputRange) -> Plan:
@@ -261,14 +270,18 @@ class Controller(ABC):
         moves, remarks = np.diff(planned, axis=0, prepend=state.inputs[-1:]).ravel(), plan.remarks
         if (np.abs(moves.reshape(self._shape)) > self._resolution).any():
             remarks = (*remarks, Remark.BACK_INSIDE)
+        violations = self._unknown_violations
+        if sample is not None:
+            violations = self.condensed.violations(sample, moves)
+        for array in (moves, planned, violations):
+            array.setflags(write=False)
         return plan._replace(
             moves=moves, lower_bound=-np.inf, inputs=planned, objective=np.nan,
-            remarks=remarks,
-            violations=self._unknown_violations if sample is None else self.condensed.violations(sample, moves),
+            remarks=remarks, violations=violations,
         )  # fmt: skip
 
     def _decision(self, plan: Plan, state: ControllerState, inputs: InputRange, start: float) -> Decision:
-        """The decision to follow a plan, complete with inputs and objective."""
+        """The decision to follow a plan, complete with inputs and objective, whose arrays are read-only."""
         assert plan.moves is not None
         assert plan.inputs is not None
         assert plan.objective is not None
@@ -281,8 +294,7 @@ class Controller(ABC):
         # What is handed out is also what is remembered.
         u, history = inputs.applied(planned), state.inputs
         history = u[None] if len(history) == 1 else np.concatenate((history[1:], u[None]))
-        for array in (planned, changes, violations, u, history, self._resolution):
-            array.setflags(write=False)
+        history.setflags(write=False)
         return Decision(
             u, planned, changes, plan.status, objective, lower_bound, plan.iterations, perf_counter() - start,
             ControllerState(history, state.samples + 1, plan.guess, plan.active, plan.memory), plan.remarks, violations,
@@ -300,8 +312,9 @@ class Controller(ABC):
         if nearest.moves is None or nearest.multipliers is None:
             return Plan(None, HELD_BY[nearest.status], nearest.iterations)
         return Plan(
-            nearest.moves, Status.OPTIMAL, nearest.iterations, None, active=active_bounds(nearest.multipliers)
-        )
+            nearest.moves, Status.OPTIMAL, nearest.iterations, None, None, None, sample.cost + nearest.excess, (),
+            active_bounds(nearest.multipliers), None, None if nearest.violated else self._no_violations,
+        )  # fmt: skip
 
     def _unrestricted_but_frozen(self, sample: Sample, frozen: Indices) -> Plan:
         """Plain MPC where some inputs may not move for some samples."""

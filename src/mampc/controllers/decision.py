@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +11,8 @@ from mampc.base.checks import Array, BoolArray
 from mampc.base.words import Fault, LoadKind, Remark, Status
 
 
-@dataclass(frozen=True, eq=False)
-class ControllerState:
-    """What a controller remembers: plain numbers, safe to copy and pickle.
+class ControllerState(NamedTuple):
+    """What a controller remembers: plain numbers, safe to copy and pickle. Equal only to itself.
 
     Attributes:
         inputs: the inputs applied so far, oldest first, shape (h, m); the last row is u_{k-1}.
@@ -30,6 +28,15 @@ class ControllerState:
     guess: Array | None = None
     active: Array | None = None
     memory: Array | None = None
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __ne__(self, other: object) -> bool:
+        return self is not other
+
+    def __hash__(self) -> int:
+        return id(self)
 
 
 class Decision(NamedTuple):

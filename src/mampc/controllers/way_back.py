@@ -6,7 +6,6 @@ it stands in the window of the rules as the latest one, and in the plan as part 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -68,7 +67,7 @@ def way_back(
         frozen = np.maximum(0 if frozen is None else frozen, spent.astype(np.intp))
     remembered = np.concatenate([state.inputs[1:], inside[None]])
     return WayBack(
-        replace(state, inputs=remembered),
+        state._replace(inputs=remembered),
         limits.applied_to(condensed.sample(parameter, inside, frozen)),
         change,
     )

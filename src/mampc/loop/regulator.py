@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -177,7 +176,7 @@ class Regulator:
                 actuators, memory.inputs, reported, self.controller.manual_inputs(manual)
             )
             if inputs is not memory.inputs:
-                memory = replace(memory, inputs=inputs)
+                memory = memory._replace(inputs=inputs)
         u_previous = memory.inputs[-1]
         v = v_last
         if measured_disturbance is not None:

@@ -39,7 +39,10 @@ class RegulatorState:
 
     def to_json(self) -> str:
         """The state as JSON text; `Regulator.state_from_json` gives the same numbers back."""
-        return json.dumps({"format": FORMAT, **asdict(self)}, default=np.ndarray.tolist)
+        return json.dumps(
+            {"format": FORMAT, **asdict(self), "controller": self.controller._asdict()},
+            default=np.ndarray.tolist,
+        )
 
     @classmethod
     def from_json(cls, text: str) -> RegulatorState:
@@ -68,12 +71,13 @@ class RegulatorState:
     def shapes(self) -> dict[str, tuple[int, ...] | None]:
         """The shape of every array, by its place; None where there is none."""
         parts = {
-            "controller": self.controller, "estimate": self.estimate, "sensors": self.sensors,
+            "estimate": self.estimate, "sensors": self.sensors,
             "actuators": self.actuators,
         }  # fmt: skip
         places = {
             f"{part}.{name}": value for part, held in parts.items() for name, value in vars(held).items()
         }
+        places |= {f"controller.{name}": value for name, value in self.controller._asdict().items()}
         places["measured_disturbance"] = self.measured_disturbance
         return {place: None if value is None else np.shape(value) for place, value in places.items()}
 

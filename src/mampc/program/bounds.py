@@ -39,7 +39,7 @@ class Bounds:
         input_rows: where the rows of the inputs stand among the bounds, a slice.
         move_of_bound: the move that makes an input row new, -1 for other bounds, shape (n_bounds,).
         above, below: rows of theta that y_max and y_min bound.
-        above_rows, below_rows: where they stand among the bounds.
+        above_rows, below_rows: where they stand among the bounds, slices.
     """
 
     def __init__(
@@ -78,8 +78,8 @@ class Bounds:
         self.size = n_simple + len(self.rows)
         self.move_of_bound = np.full(self.size, -1)
         self.move_of_bound[self.input_rows] = inputs
-        self.above_rows = self.input_rows.stop + np.arange(len(self.above))
-        self.below_rows = self.input_rows.stop + len(self.above) + np.arange(len(self.below))
+        start, middle = self.input_rows.stop, self.input_rows.stop + len(self.above)
+        self.above_rows, self.below_rows = slice(start, middle), slice(middle, middle + len(self.below))
 
         self._theta_above, self._theta_below = theta[self.above], theta[self.below]
         self.lower, self.upper = (parameter.no_map(self.size) for _ in range(2))
@@ -124,16 +124,19 @@ class Bounds:
             faded: the e of `TrackingProblem`, for which later excess counts more.
         """
         excess = np.zeros(len(self.violation_scale))
-        above = self._theta_above @ moves - upper[self.above_rows]
-        below = lower[self.below_rows] - self._theta_below @ moves
-        if faded:
-            above, below = above / self._fading_above, below / self._fading_below
+        above, below = self._above_outputs, self._below_outputs
         # Rows come sample by sample, each with the same outputs.
-        for over, outputs in ((above, self._above_outputs), (below, self._below_outputs)):
-            if len(over):
-                largest = over.reshape(-1, len(outputs)).max(axis=0)
-                excess[outputs] = np.maximum(excess[outputs], largest)
-        return excess
+        if len(above):
+            over = self._theta_above.dot(moves) - upper[self.above_rows]
+            if faded:
+                over /= self._fading_above
+            excess[above] = over.reshape(-1, len(above)).max(axis=0)
+        if len(below):
+            over = lower[self.below_rows] - self._theta_below.dot(moves)
+            if faded:
+                over /= self._fading_below
+            excess[below] = np.maximum(excess[below], over.reshape(-1, len(below)).max(axis=0))
+        return np.maximum(excess, 0.0)
 
 
 def _least_move_cost(problem: TrackingProblem, prediction: Prediction) -> Array:

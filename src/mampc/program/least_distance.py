@@ -32,6 +32,7 @@ class Nearest(NamedTuple):
     multipliers: Array | None
     status: QPStatus
     iterations: int
+    violated: bool = False  # whether some violation is above zero
 
 
 class LeastDistance:
@@ -84,8 +85,9 @@ class LeastDistance:
         if solution.z is None or solution.multipliers is None:
             return Nearest(None, np.inf, None, solution.status, solution.iterations)
         v, z = self._v, solution.z * scale
-        delta, excess = z[v:], 0.0
-        if v:
+        delta, excess, violated = z[v:], 0.0, False
+        if v and z[:v].max() > 0:
+            violated = True
             a = np.maximum(z[:v] * self._per_violation, 0.0)
             excess = self._weight * float(a.sum() + 0.5 * a.dot(a))
         excess += float(delta.dot(delta))
@@ -95,7 +97,7 @@ class LeastDistance:
         pull = multipliers[simple]
         at_bound = np.where(pull > 0, upper[simple], lower[simple])
         moves[: self._n_simple] = np.where(pull == 0, moves[: self._n_simple], at_bound)
-        return Nearest(moves, excess, multipliers, solution.status, solution.iterations)
+        return Nearest(moves, excess, multipliers, solution.status, solution.iterations, violated)
 
     def relaxed(self, optimum: Array, lower: Array, upper: Array, multipliers: Array) -> tuple[Array, float]:
         """The optimum with limits priced by multipliers: its delta, and its cost beyond that of the optimum without."""

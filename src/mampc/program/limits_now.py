@@ -62,7 +62,9 @@ class InputRange:
             first: Array = plan[0]
             return first
         low, high = np.atleast_2d(self._low)[0], np.atleast_2d(self._high)[0]
-        return np.asarray(np.minimum(np.maximum(plan[0], low), high))
+        u = np.asarray(np.minimum(np.maximum(plan[0], low), high))
+        u.setflags(write=False)
+        return u
 
     def leaving(self, manual: BoolArray, u: Array) -> InputRange:
         """The same range, with inputs in manual, shape (m,), left where u, shape (m,), is beyond it at some sample."""
@@ -170,7 +172,7 @@ class LimitsNow:
             self.inputs.low - u, self.inputs.high - u, bound_of_move, condensed.input_prefix,
         )  # fmt: skip
         return Sample(
-            sample.data, sample.parts, sample.parameter, sample.u_previous, sample.frozen, bounds_now
+            sample.data.copy(), sample.parts, sample.parameter, sample.u_previous, sample.frozen, bounds_now
         )
 
 

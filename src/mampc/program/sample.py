@@ -98,6 +98,7 @@ class Sample(Optimum):
         if bounds_now is not None:
             data[parts.lower], data[parts.upper] = bounds_now.lower, bounds_now.upper
             self._margins = bounds_now.margins(data[parts.moves])
+        data.setflags(write=False)  # and with it every view that is handed out
 
     @property
     def target(self) -> Array:
