@@ -11,7 +11,7 @@ import mampc
 from mampc.base.csv_table import CSV_FILE_LIMIT, CSVTable
 from mampc.base.files import written_whole
 from mampc.report.folder import MANIFEST, ResultFolder
-from mampc.systems.state_space import MOST_STATES
+from mampc.systems.model_file import MOST_STATES
 
 READERS = {
     "model": mampc.StateSpace.load,

@@ -10,7 +10,7 @@ import scipy.signal
 
 from builders import random_model
 from mampc import MampcError, Names, StateSpace, linearise
-from mampc.systems.state_space import MODEL_FILE_LIMIT
+from mampc.systems.model_file import MODEL_FILE_LIMIT
 
 A, B, C, D = np.diag([0.5, 0.8]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1))
 CONTINUOUS = [[-1.0, 0.5], [0.0, -3.0]], [[1.0], [2.0]], [[1.0, 0.0]], [[0.0]]

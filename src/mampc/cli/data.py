@@ -1,4 +1,4 @@
-"""Commands about records: `inspect`, `identify`."""
+"""Commands about records and models: `inspect`, `identify`, `show`."""
 
 from __future__ import annotations
 
@@ -190,6 +190,41 @@ def identify(
     for warning in outcome.warnings:
         complain(f"warning: {warning}")
     console.print(f"Wrote {target}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def show(
+    model: Annotated[Path, typer.Argument(help="A model file, such as `mampc identify` writes.")],
+    figure: Annotated[
+        Path | None,
+        typer.Option("--figure", "-f", help="Draw the step responses (PNG and SVG of this name)."),
+    ] = None,
+) -> None:
+    """What a model says of its plant.
+
+    Gains with their uncertainty where it is known, time constants, dead times, integrators, interaction of
+    inputs and outputs, zeros that limit control, noise.
+
+    Example:
+
+        mampc show model.json --figure steps.png
+    """
+    from mampc.report.output import save_figure
+    from mampc.report.showing import model_tables, model_words
+    from mampc.systems.state_space import StateSpace
+
+    shown = StateSpace.load(model)
+    console = console_for_tables()
+    console.print(repr(shown), soft_wrap=True, markup=False)
+    if not shown.is_discrete:
+        raise MampcError(f"{model}: expected a discrete model, received one in continuous time")
+    for table in model_tables(shown):
+        console.print(table)
+    for sentence in model_words(shown):
+        console.print(f"  - {sentence}", soft_wrap=True, markup=False)
+    if figure is not None:
+        save_figure(shown.plot(), figure.with_suffix(""))
+        console.print(f"Wrote {figure.with_suffix('.png')} and .svg", soft_wrap=True, markup=False)
 
 
 def _reading(

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mampc.base.checks import as_number
 from mampc.base.errors import MampcError
@@ -14,10 +16,13 @@ from mampc.identification import Identified, IOData, Validation, n4sid, read_exp
 from mampc.identification.export.findings import counted
 from mampc.report.figures import validation_figure
 from mampc.report.output import save_figure
+from mampc.systems.evidence import Evidence
+from mampc.systems.properties import properties
 
 POOR_FIT = 40.0  # percent; a model below it is hardly one to control with
 SHORTEST = 10  # samples on either side of a cut
 SHORT = 30  # samples: a piece with fewer has neither past nor future for the usual 15 block rows
+LONGEST_BAND = 200  # samples of a step response whose uncertainty is kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +75,10 @@ def identify_and_write(
     show("identifying a model")
     identified = n4sid(estimation if len(estimation) > 1 else estimation[0], **settings)
     validation = identified.validate(rest)
+    show("estimating how certain it is")
+    identified = replace(
+        identified, model=replace(identified.model, evidence=evidence_of(identified, records))
+    )
     show("writing the model and its figure")
     identified.model.save(target)
     warnings = []
@@ -102,6 +111,18 @@ def long_enough(records: Sequence[IOData], notes: list[str]) -> Sequence[IOData]
         return records
     notes.append(f"{lost}, left out of the identification; --fill closes short gaps")
     return kept
+
+
+def evidence_of(identified: Identified, records: Sequence[IOData]) -> Evidence:
+    """The ranges of all records, and how uncertain the step response is until it has settled."""
+    u, y = (np.concatenate([getattr(record, signal) for record in records]) for signal in ("u", "y"))
+    samples = int(properties(identified.model).settling_time / identified.model.dt) + 1
+    try:
+        deviation = identified.uncertainty(min(max(samples, SHORTEST), LONGEST_BAND))
+    except MampcError:  # too short a record
+        deviation = None
+    inputs, outputs = (np.stack([s.min(axis=0), s.max(axis=0)], axis=1) for s in (u, y))
+    return Evidence(inputs, outputs, deviation)
 
 
 def hold_out(records: Sequence[IOData], share: float) -> tuple[list[IOData], IOData]:

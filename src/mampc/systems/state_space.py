@@ -10,22 +10,20 @@ those of u in B and D.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mampc.base.checks import Array, ComplexArray, as_array, as_matrix, as_number, as_vector, as_whole
 from mampc.base.errors import MampcError
-from mampc.base.files import read_text, written_whole
 from mampc.base.names import Names, require_count
+from mampc.systems.evidence import Evidence
 from mampc.systems.noise import Noise
 
-MODEL_FILE_LIMIT = 16 * 2**20  # bytes; the largest model fits with room to spare
-MOST_STATES = 500  # of a model in a file; far beyond it, a controller takes minutes to build
-MOST_SIGNALS = 200  # inputs of a model in a file, and outputs; far beyond it, a study takes hours
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +37,7 @@ class StateSpace:
         names: signal names; default u1.., y1.., x1.., and no measured disturbances (d = 0).
         v_op: measured disturbances at the operating point, shape (d,); default zeros.
         noise: what a record said of the disturbances, or None.
+        evidence: what else it said: ranges of the signals, how uncertain the step response is; or None.
 
     Raises:
         MampcError: shapes that do not fit together, non-finite numbers, a negative dt.
@@ -54,6 +53,7 @@ class StateSpace:
     names: Names = None  # type: ignore[assignment]
     v_op: Array = None  # type: ignore[assignment]
     noise: Noise | None = None
+    evidence: Evidence | None = None
 
     def __post_init__(self) -> None:
         A = as_matrix("A", self.A)
@@ -82,6 +82,8 @@ class StateSpace:
         }  # fmt: skip
         if self.noise is not None and self.noise.output.shape != (l,):
             raise MampcError(f"noise: expected {l} outputs, received {self.noise.output.size}")
+        if self.evidence is not None and not self.evidence.matches(l, columns):
+            raise MampcError(f"evidence: expected {columns} inputs and {l} outputs, received other numbers")
         for name, value in checked.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
@@ -99,6 +101,14 @@ class StateSpace:
         return (
             f"StateSpace({', '.join(parts)}, {f'dt = {self.dt:g} s' if self.is_discrete else 'continuous'})"
         )
+
+    def __str__(self) -> str:
+        """The model, and gain, time constant and dead time of its first channels."""
+        if not self.is_discrete:
+            return repr(self)
+        from mampc.systems.properties import channels_in_words
+
+        return "\n".join([repr(self), *channels_in_words(self)])
 
     @property
     def n_states(self) -> int:
@@ -246,6 +256,20 @@ class StateSpace:
         y: Array = states @ self.C.T + du @ self.D.T + self.y_op
         return y
 
+    def plot(self, *, deviation: Any = None) -> Figure:
+        """Step responses of all outputs to all inputs, until they have settled; needs mampc[plot].
+
+        Args:
+            deviation: standard deviations of the step response, such as of `Identified.uncertainty`, shape
+                (samples, l, m + d), for a band of two to either side; default those of its `evidence`.
+
+        Raises:
+            MampcError: a continuous model, more than 100 panels, or a deviation of another shape.
+        """
+        from mampc.systems.step_figure import step_figure
+
+        return step_figure(self, deviation)
+
     @classmethod
     def from_first_order(
         cls,
@@ -359,48 +383,16 @@ class StateSpace:
         Raises:
             MampcError: a model larger than `load` takes, or a file that cannot be written.
         """
-        self._require_moderate(path)
-        arrays = ("A", "B", "C", "D", "u_op", "y_op", "v_op")
-        content = {
-            "format": "mampc-model-1",
-            "dt": self.dt,
-            **{k: np.asarray(getattr(self, k)).tolist() for k in arrays},
-            "names": {k: list(names) for k, names in asdict(self.names).items()},
-        }
-        if self.noise is not None:
-            content["noise"] = {k: value.tolist() for k, value in asdict(self.noise).items()}
-        with written_whole(path) as unfinished:
-            unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        from mampc.systems.model_file import write
+
+        write(self, path)
 
     @classmethod
     def load(cls, path: str | Path) -> StateSpace:
         """Read a model written by `save`; raises `MampcError` for anything else."""
-        try:
-            content = json.loads(read_text(path, MODEL_FILE_LIMIT, "mampc model file"))
-        except MampcError:
-            raise
-        except (ValueError, RecursionError) as error:
-            raise MampcError(f"{path}: expected a mampc model file, received: {error}") from None
-        if not isinstance(content, dict) or content.get("format") != "mampc-model-1":
-            raise MampcError(f"{path}: expected a model file with format 'mampc-model-1'")
-        try:
-            names = Names(**{k: tuple(v) for k, v in content["names"].items()})
-            matrices = {k: content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")}
-            noise = Noise(**content["noise"]) if "noise" in content else None
-            model = cls(**matrices, names=names, v_op=content.get("v_op", 0.0), noise=noise)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise MampcError(f"{path}: expected A, B, C, D, dt, u_op, y_op, names; {error!r}") from None
-        except MampcError as error:
-            raise MampcError(f"{path}: {error}") from None
-        model._require_moderate(path)
-        return model
+        from mampc.systems.model_file import read
 
-    def _require_moderate(self, path: str | Path) -> None:
-        if self.n_states > MOST_STATES or max(self.D.shape) > MOST_SIGNALS:
-            raise MampcError(
-                f"{path}: expected a model of at most {MOST_STATES} states and {MOST_SIGNALS} inputs and outputs each, "
-                f"received {self.n_states}, {self.B.shape[1]} and {self.n_outputs}; reduce its order"
-            )
+        return read(path)
 
 
 def _listed(names: tuple[str, ...]) -> str:

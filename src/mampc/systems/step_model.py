@@ -17,7 +17,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_array, as_number, require_finite
 from mampc.base.errors import MampcError
-from mampc.systems.state_space import MOST_STATES
+from mampc.systems.model_file import MOST_STATES
 
 MOST_COEFFICIENTS = 2000
 LARGEST_HANKEL = 2000  # columns of the Hankel matrix; its decomposition takes the cube of it

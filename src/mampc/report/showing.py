@@ -1,0 +1,118 @@
+"""A model in words and tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mampc.systems.properties import Properties, properties, time_in_words
+from mampc.systems.state_space import StateSpace
+
+INTERACTING = 10.0  # condition number, or relative gain, from which one is told
+
+
+def model_tables(model: StateSpace) -> list[Any]:
+    """Channels with gain, time constant and dead time; the relative gains of a model with several inputs."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    found = properties(model)
+    inputs, outputs = (*model.names.inputs, *model.names.disturbances), model.names.outputs
+    deviation = _gain_deviation(model, found)
+    units = dict(model.names.units)
+    channels = Table(title="channels")
+    channels.add_column("output")
+    channels.add_column("input")
+    for header in ("gain", *(["± (standard deviation)"] if deviation is not None else [])):
+        channels.add_column(header, justify="right")
+    channels.add_column("unit")
+    for header in ("time constant", "dead time"):
+        channels.add_column(header, justify="right")
+    for i, j in np.ndindex(found.gain.shape):
+        if found.gain[i, j] == 0:
+            continue
+        integrates = bool(found.integrating[i, j])
+        unit = _unit(units.get(outputs[i]), units.get(inputs[j]), integrates)
+        constant, dead = float(found.time_constant[i, j]), float(found.dead_time[i, j])
+        channels.add_row(
+            escape(outputs[i]),
+            escape(inputs[j]),
+            f"{found.gain[i, j]:.4g}",
+            *([f"{deviation[i, j]:.2g}"] if deviation is not None else []),
+            escape(unit),
+            "integrates" if integrates else time_in_words(constant) if np.isfinite(constant) else "grows",
+            time_in_words(dead) if dead > 0 else "none",
+        )
+    if found.relative_gain is None or max(found.relative_gain.shape) < 2:
+        return [channels]
+    relative = Table(title="relative gains")
+    relative.add_column("output")
+    for name in model.names.inputs:
+        relative.add_column(escape(name), justify="right")
+    for name, row in zip(outputs, found.relative_gain, strict=True):
+        relative.add_row(escape(name), *(f"{round(value, 2) + 0.0:.2f}" for value in row))
+    return [channels, relative]
+
+
+def model_words(model: StateSpace) -> list[str]:
+    """Everything that is no property of one channel, a sentence each."""
+    found = properties(model)
+    sentences = [
+        f"sampled every {time_in_words(model.dt)}; settles within {time_in_words(found.settling_time)}"
+    ]
+    if found.integrators:
+        sentences.append(f"{found.integrators} of its poles integrate: they are at one")
+    if found.unstable:
+        sentences.append(f"unstable: {found.unstable} of its poles are outside the unit circle")
+    if found.condition is not None and found.condition > 1:
+        hard = found.condition > INTERACTING
+        sentences.append(
+            f"condition number of the gains {found.condition:.3g}, all signals taken alike"
+            + ("; some combination of outputs takes large moves of all inputs" if hard else "")
+        )
+    if found.limiting_zeros is not None and len(found.limiting_zeros):
+        times = ", ".join(time_in_words(value) for value in found.limiting_zeros[:5])
+        sentences.append(
+            f"zeros in the right half plane with time constants {times}: no control is faster than about that"
+        )
+    if model.noise is not None:
+        sentences.append(f"noise of the outputs: {_named(model.names.outputs, model.noise.output)}")
+        if model.noise.drift.any():
+            sentences.append(
+                f"wandering of the outputs: {_named(model.names.outputs, model.noise.drift)} a sample"
+            )
+    doubtful = _doubtful(model, found)
+    if doubtful:
+        sentences.append(f"the sign of the gain is uncertain: {', '.join(doubtful)}; move these inputs more")
+    return sentences
+
+
+def _gain_deviation(model: StateSpace, found: Properties) -> Any:
+    """Standard deviations of the gains, (l, m + d), where the record told those of the step response."""
+    deviation = None if model.evidence is None else model.evidence.deviation
+    if deviation is None:
+        return None
+    length = max(len(deviation) - 1, 1) * model.dt
+    return deviation[-1] / np.where(found.integrating, length, 1.0)
+
+
+def _doubtful(model: StateSpace, found: Properties) -> list[str]:
+    """Channels whose gain is less than two standard deviations, named."""
+    deviation = _gain_deviation(model, found)
+    if deviation is None:
+        return []
+    inputs = (*model.names.inputs, *model.names.disturbances)
+    weak = (np.abs(found.gain) < 2 * deviation) & (found.gain != 0)
+    return [f"{model.names.outputs[i]} from {inputs[j]}" for i, j in np.argwhere(weak)]
+
+
+def _unit(output: str | None, of_input: str | None, integrates: bool) -> str:
+    if not output and not of_input:
+        return "1/s" if integrates else ""
+    return f"{output or '1'}/{of_input or '1'}" + ("/s" if integrates else "")
+
+
+def _named(names: tuple[str, ...], values: Any) -> str:
+    shown = [f"{name} {value:.3g}" for name, value in zip(names, values, strict=True)]
+    return ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "")
