@@ -7,6 +7,7 @@ from mampc import plants, rivals
 from mampc.base.errors import MampcError, StudyError
 from mampc.base.names import Names
 from mampc.base.words import Fault, LoadKind, Remark, Status
+from mampc.compare.tuning import Tuned, tune
 from mampc.controllers import MAMPC, MPC, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
 from mampc.identification import Export, Identified, IOData, Validation, excite, n4sid, read_export, validate
@@ -85,6 +86,7 @@ __all__ = [
     "Status",
     "StudyError",
     "TrackingProblem",
+    "Tuned",
     "Validation",
     "Valves",
     "excite",
@@ -100,5 +102,6 @@ __all__ = [
     "simulate",
     "simulate_batch",
     "steps",
+    "tune",
     "validate",
 ]

@@ -1,0 +1,282 @@
+"""Closed loops to tune on: stand-ins for the plant, references, noise and loads, all drawn from a model by seeds.
+
+Sizes come from the model and its limits alone, so that units decide nothing: references from what a share of the
+inputs' range does, noise from `model.noise` or a share of what the whole range does, loads from what shows in the
+outputs like their noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_vector
+from mampc.base.errors import MampcError
+from mampc.base.tolerances import SAME
+from mampc.loop.batch import simulate_batch
+from mampc.loop.disturbances import response_within_reach
+from mampc.loop.estimation import static_response
+from mampc.loop.loads import Coloured, Load, RandomSteps, RandomWalk, drawn
+from mampc.loop.regulator import Regulator
+from mampc.program.problem import Limits, TrackingProblem
+from mampc.systems.mismatch import Mismatch
+from mampc.systems.state_space import StateSpace
+
+SETTLED = 0.05  # share of a step response's largest value that may be missing where it has settled
+LONGEST_SETTLING = 500  # samples that are looked at
+HORIZONS = (10, 60)  # fewest and most samples of a prediction horizon
+FREE_MOVES = 5  # control horizon of plain MPC
+CONDITION = 500.0  # of the program that the move weight of plain MPC aims at, as in dynamic matrix control
+
+NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
+MOVED = 0.03  # share of the inputs' range that set-points ask for, either way
+CHANGES = 4  # set-point changes of a scenario
+LENGTHS = (160, 300)  # fewest and most samples of a scenario
+HORIZONS_LONG = 5  # a scenario lasts that many prediction horizons, within these
+
+STAND_IN = Mismatch(gain=0.15, lag=0.15, dead_time=0.15)
+HALVED = 3  # times that a stand-in's shares are halved where plain MPC does not cope with it
+COPES = 5.0  # times its error on the model that plain MPC may have on a stand-in
+
+STEP, WALK, COLOURED, LAG = 10.0, 0.4, 3.0, 10  # sizes of loads, times noise over gain; the last in samples
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is known, or assumed, of everything around the controller.
+
+    Attributes:
+        noise: standard deviations of the measurement noise, shape (l,).
+        reference_changes: set-points differ from the operating point by up to these, shape (l,); None where they
+            are what a share of the inputs' range does.
+        loads: kinds of scenarios, each a tuple of loads; scenarios take them in turn.
+    """
+
+    noise: Array
+    reference_changes: Array | None
+    loads: tuple[tuple[Load, ...], ...]
+
+    @classmethod
+    def of(
+        cls, problem: TrackingProblem, noise: Any, reference_changes: Any, loads: Sequence[Load] | None
+    ) -> Surroundings:
+        """What is told, and what the model and its limits say in place of the rest.
+
+        Raises:
+            MampcError: values that do not fit the model, or inputs without limits where these are needed.
+        """
+        model = problem.model
+        l = model.n_outputs
+        if noise is None and model.noise is not None and (model.noise.output > 0).all():
+            noise = model.noise.output
+        if noise is None:
+            noise = NOISE_OF_REACH * np.abs(response_within_reach(model)) @ _range(problem, "noise")
+            if not (noise > 0).all():
+                raise MampcError(
+                    f"noise: expected inputs that move every output, received a reach of {noise}"
+                )
+        sizes = as_vector("noise", noise, l)
+        if (sizes <= 0).any():
+            raise MampcError(f"noise: expected positive standard deviations, received {sizes}")
+        changes = None
+        if reference_changes is not None:
+            changes = as_vector("reference_changes", reference_changes, l)
+            if (changes < 0).any():
+                raise MampcError(f"reference_changes: expected numbers of at least 0, received {changes}")
+        else:
+            _range(problem, "reference_changes")
+        kinds = every_kind(model, sizes, scenario_length(problem)) if loads is None else (_given(loads),)
+        return cls(sizes, changes, kinds)
+
+
+def _given(loads: Sequence[Load]) -> tuple[Load, ...]:
+    if not isinstance(loads, Sequence):
+        raise MampcError(f"loads: expected a list of mampc.loads, received {type(loads).__name__}")
+    return tuple(loads)
+
+
+def every_kind(model: StateSpace, noise: Array, samples: int) -> tuple[tuple[Load, ...], ...]:
+    """Loads of every kind at the inputs, the last of them none."""
+    effect = np.linalg.norm(response_within_reach(model) / noise[:, None], axis=0) / np.sqrt(len(noise))
+    unit = np.where(effect > 0, 1 / np.where(effect > 0, effect, 1.0), 0.0)
+    return (
+        (RandomSteps(size=STEP * unit, every=samples * model.dt / 2),),
+        (RandomWalk(size=WALK * unit),),
+        (Coloured(size=COLOURED * unit, time_constant=LAG * model.dt),),
+        (),
+    )
+
+
+def usual_problem(model: StateSpace, limits: Limits, output_weight: Any) -> TrackingProblem:
+    """Plain MPC of a model: the prediction horizon covers what step responses take to settle, in bounded samples.
+
+    The move weight of an input is the curvature of its first move over 500 / nc, with nc the control horizon.
+
+    Source of the latter: Shridhar and Cooper, Ind. Eng. Chem. Research 36 (1997).
+    """
+    n_p = int(np.clip(settling(model), *HORIZONS))
+    n_c = min(FREE_MOVES, n_p)
+    settings = {"prediction_horizon": n_p, "control_horizon": n_c, "output_weight": output_weight}
+    problem = TrackingProblem(model, **settings, move_weight=1.0, limits=limits)
+    response = model.step_response(n_p + 1)[:, :, : model.n_inputs]
+    curvature = np.einsum("kij,ia,kaj->j", response, problem.output_weight, response)
+    curvature = np.where(curvature > 0, curvature, curvature.max() or 1.0)
+    return replace(problem, move_weight=curvature * n_c / CONDITION)
+
+
+def settling(model: StateSpace) -> int:
+    """Samples until every step response stays where it leads; of models that integrate, until its slope does."""
+    response = model.step_response(LONGEST_SETTLING + 1)[:, :, : model.n_inputs]
+    if np.abs(model.poles()).max(initial=0.0) > 1 - 1e-6:
+        response = np.diff(response, axis=0)
+    if not np.isfinite(response).all():
+        return 0
+    off = np.abs(response - response[-1]) > SETTLED * np.abs(response).max(axis=0)
+    return int(np.flatnonzero(off.any(axis=(1, 2))).max(initial=-1)) + 1
+
+
+def scenario_length(problem: TrackingProblem) -> int:
+    """Samples of a scenario."""
+    return int(np.clip(HORIZONS_LONG * problem.prediction_horizon, *LENGTHS))
+
+
+@dataclass(frozen=True, eq=False)
+class Scenarios:
+    """S closed loops; see the module. Equal for every regulator that is run in them.
+
+    Attributes:
+        plants: stand-ins, one a loop.
+        seeds: of their noise.
+        reference, at_inputs, at_outputs, measured: courses, loops first: (S, T, l), (S, T, m), (S, T, l), (S, T, d).
+        noise: standard deviations, shape (l,).
+        weight: of the outputs' errors, shape (l, l).
+        u_initial: inputs at rest, shape (m,).
+    """
+
+    plants: tuple[StateSpace, ...]
+    seeds: tuple[int, ...]
+    reference: Array
+    at_inputs: Array
+    at_outputs: Array
+    measured: Array
+    noise: Array
+    weight: Array
+    u_initial: Array
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    @property
+    def hours(self) -> float:
+        """Length of one."""
+        return float(self.reference.shape[1] * self.plants[0].dt / 3600)
+
+    @classmethod
+    def drawn(
+        cls, regulator: Regulator, around: Surroundings, count: int, seed: tuple[int, int]
+    ) -> Scenarios:
+        """Scenarios on stand-ins with which this regulator, plain MPC, copes."""
+        problem = regulator.controller.problem
+        model, T = problem.model, scenario_length(problem)
+        rng = np.random.default_rng(seed)
+        seeds = tuple(rng.integers(2**31, size=count).tolist())
+        start = np.clip(model.u_op, problem.limits.u_min, problem.limits.u_max)
+        signals = {"input": model.n_inputs, "output": model.n_outputs, "measured": model.n_disturbances}
+        courses = {place: np.zeros((count, T, width)) for place, width in signals.items()}
+        courses["measured"] += model.v_op
+        for s, own in enumerate(seeds):
+            for place, load in drawn(around.loads[s % len(around.loads)], T, model.dt, own, signals):
+                courses[place][s] += load
+        reference = np.array([_reference(problem, around, start, T, own) for own in seeds])
+        on_model = cls(
+            (model,) * count, seeds, reference, courses["input"], courses["output"], courses["measured"],
+            around.noise, problem.output_weight, start,
+        )  # fmt: skip
+        return on_model._with_stand_ins(regulator, model)
+
+    def _with_stand_ins(self, regulator: Regulator, model: StateSpace) -> Scenarios:
+        usual, plants, share = self.run(regulator)[1], list(self.plants), 1.0
+        missing = list(range(len(self)))
+        for _ in range(HALVED + 1):
+            off = Mismatch(**{name: share * part for name, part in vars(STAND_IN).items()})
+            tried = replace(
+                self.only(missing), plants=tuple(_stand_in(off, model, self.seeds[s]) for s in missing)
+            )
+            error = tried.run(regulator)[1]
+            fine = error <= COPES * usual[missing]
+            for s, plant in zip(np.array(missing)[fine].tolist(), np.flatnonzero(fine).tolist(), strict=True):
+                plants[s] = tried.plants[plant]
+            missing = np.array(missing)[~fine].tolist()
+            share /= 2
+            if not missing:
+                break
+        return replace(self, plants=tuple(plants))
+
+    def only(self, loops: Sequence[int]) -> Scenarios:
+        """Some of them."""
+        parts = {
+            name: getattr(self, name)[list(loops)]
+            for name in ("reference", "at_inputs", "at_outputs", "measured")
+        }
+        return replace(
+            self,
+            plants=tuple(self.plants[s] for s in loops),
+            seeds=tuple(self.seeds[s] for s in loops),
+            **parts,
+        )
+
+    def run(self, regulator: Regulator) -> tuple[Array, Array]:
+        """Moves of all inputs together and tracking error, mean of (y - r)' Q (y - r), of each loop, shapes (S,)."""
+        batch = simulate_batch(
+            self.plants, regulator, self.reference, seeds=self.seeds, noise=self.noise,
+            input_disturbance=self.at_inputs, output_disturbance=self.at_outputs,
+            measured_disturbance=self.measured if self.measured.shape[2] else None,
+            u_initial=self.u_initial, progress=False,
+        )  # fmt: skip
+        changes = np.abs(np.diff(np.concatenate([batch.u_initial[:, None], batch.u], axis=1), axis=1))
+        moves = (changes > SAME * regulator.controller.condensed.input_prefix).sum(axis=(1, 2)).astype(float)
+        with np.errstate(over="ignore", invalid="ignore"):
+            off = batch.y - batch.r
+            error = np.einsum("sti,ij,stj->s", off, self.weight, off) / off.shape[1]
+        return moves, np.where(np.isfinite(error), error, np.inf)
+
+
+def _stand_in(off: Mismatch, model: StateSpace, seed: int) -> StateSpace:
+    """A plant off the model; the model itself where its pairs cannot be taken apart."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return off.drawn(model, seed)
+    except (MampcError, np.linalg.LinAlgError):
+        return model
+
+
+def _reference(problem: TrackingProblem, around: Surroundings, start: Array, T: int, seed: int) -> Array:
+    """Set-points of one scenario, shape (T, l): levels that change all at once, a few times."""
+    model, limits = problem.model, problem.limits
+    rng = np.random.default_rng([seed, 0x52])
+    gain = static_response(model)
+    rest = model.y_op + model.C @ model.steady_state(start) + model.D[:, : len(start)] @ (start - model.u_op)
+    rows, period = np.tile(rest, (T, 1)), T / CHANGES
+    for change in range(CHANGES):
+        at = int((change + 0.5 * rng.random()) * period)
+        if around.reference_changes is None:
+            wanted = start + MOVED * _range(problem, "reference_changes") * rng.uniform(-1, 1, len(start))
+            level = rest + gain @ (np.clip(wanted, limits.u_min, limits.u_max) - start)
+        else:
+            level = rest + around.reference_changes * rng.uniform(-1, 1, len(rest))
+        rows[at:] = np.clip(level, limits.y_min, limits.y_max)
+    return rows
+
+
+def _range(problem: TrackingProblem, name: str) -> Array:
+    """Ranges of the inputs, shape (m,); `MampcError` where they have none."""
+    width: Array = problem.limits.u_max - problem.limits.u_min
+    if not (np.isfinite(width) & (width > 0)).all():
+        raise MampcError(
+            f"{name}: expected values, or limits u_min and u_max of all inputs to derive them from, "
+            f"received the ranges {width}"
+        )
+    return width

@@ -1,0 +1,438 @@
+"""One knob: the controller with the fewest moves at an error that one allows, found on stand-ins for the plant.
+
+A few candidates (how fast the estimator follows loads, move weight, tail) are run over a grid of prices; the best go on
+with more prices in fresh scenarios; the best of these is confirmed in scenarios that nothing was chosen by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_number, as_whole
+from mampc.base.errors import MampcError
+from mampc.compare.fronts import FEWEST, Estimate, Point, non_dominated
+from mampc.compare.scenarios import Scenarios, Surroundings, usual_problem
+from mampc.controllers import MAMPC, MPC
+from mampc.loop.estimation import KalmanFilter
+from mampc.loop.regulator import Regulator
+from mampc.loop.simulation import watched
+from mampc.moves.rules import MoveRules
+from mampc.program.problem import Limits, TrackingProblem
+from mampc.systems.state_space import StateSpace
+
+DRIFTS = (0.1, 0.3, 1.0)  # of the loads that an estimator expects, times the noise
+MOVE_WEIGHTS = (0.03, 0.3)  # times those of plain MPC
+CONTROL_HORIZON = 3
+MOST_MOVES = 9  # planned moves of all inputs together, which keeps the patterns to a few hundred
+
+SEARCHED, REFINED, CONFIRMED = 8, 16, 32  # scenarios of the three rounds
+SEARCH_PRICES, REFINE_PRICES = 6, 11
+SEARCH_SPAN = (3e-3, 3.0)  # prices over the error of plain MPC in a prediction horizon
+REFINE_SPAN = 4.0  # prices up and down from where the first round led
+FINALISTS = 2
+AIM = 0.9  # share of the allowance that the first two rounds aim at
+BACK = 0.8  # factor of the price where a confirmation fails
+TRIES = 16  # confirmations of one finalist
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A controller but for its price.
+
+    Attributes:
+        name: in tables.
+        problem: what it solves.
+        drift: of its estimator, times the noise.
+        noise: that its estimator expects, shape (l,).
+    """
+
+    name: str
+    problem: TrackingProblem
+    drift: float
+    noise: Array
+
+    @property
+    def estimator(self) -> KalmanFilter:
+        """Its Kalman filter."""
+        return KalmanFilter.offset_free(
+            self.problem.model, measurement_noise=self.noise, drift=self.drift * self.noise
+        )
+
+    def regulator(self, price: float) -> Regulator:
+        """It, with a price."""
+        return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.estimator)
+
+    def points(self, prices: Sequence[float], scenarios: Scenarios) -> list[Point]:
+        """Its moves and errors in every scenario, price by price."""
+        return [Point(self.name, price, *scenarios.run(self.regulator(price))) for price in prices]
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is allowed: an increase of the error over that of plain MPC, or moves per hour."""
+
+    max_error_increase: float | None
+    max_moves_per_hour: float | None
+    hours: float = field(default=0.0, kw_only=True)
+
+    def used(self, point: Point, baseline: Point) -> Estimate:
+        """The share of what is allowed that a setting uses, 1 for all of it."""
+        if self.max_error_increase is not None:
+            ratio = error_ratio(point, baseline)
+            return Estimate(
+                (ratio.value - 1) / self.max_error_increase, ratio.standard_error / self.max_error_increase
+            )
+        assert self.max_moves_per_hour is not None
+        moves = moves_per_hour(point, self.hours)
+        return Estimate(moves.value / self.max_moves_per_hour, moves.standard_error / self.max_moves_per_hour)
+
+    def at_aim(self, points: Sequence[Point], baseline: Point) -> tuple[float, float]:
+        """How good a candidate is where it uses `AIM` of what is allowed, lower being better, and the price there.
+
+        Infinite where no price uses so little.
+        """
+        order = sorted(points, key=lambda point: point.value)
+        used = np.array([self.used(point, baseline).value for point in order])
+        if self.max_error_increase is not None:  # a higher price uses more of it
+            used = np.maximum.accumulate(used)
+            worth = np.log([max(point.moves.mean(), FEWEST) for point in order])
+        else:
+            used, order = np.maximum.accumulate(used[::-1]), order[::-1]
+            worth = np.log([max(point.error.mean(), 1e-300) for point in order])
+        logs = np.log([point.value for point in order])
+        if used[0] > AIM:
+            return np.inf, float(np.exp(logs[0]))
+        return float(np.interp(AIM, used, worth)), float(np.exp(np.interp(AIM, used, logs)))
+
+    @property
+    def back(self) -> float:
+        """The factor by which a price uses less."""
+        return BACK if self.max_error_increase is not None else 1 / BACK
+
+
+def error_ratio(point: Point, baseline: Point) -> Estimate:
+    """Mean error over that of plain MPC in the same loops, with the standard error of this ratio of means."""
+    mean = float(baseline.error.mean())
+    ratio = float(point.error.mean()) / mean
+    if not np.isfinite(ratio):
+        return Estimate(np.inf, np.inf)
+    return Estimate(ratio, _standard_error(point.error - ratio * baseline.error) / mean)
+
+
+def moves_per_hour(point: Point, hours: float) -> Estimate:
+    """Mean moves of all inputs together in an hour."""
+    return Estimate(float(point.moves.mean()) / hours, _standard_error(point.moves) / hours)
+
+
+def _standard_error(values: Array) -> float:
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What tuning promises: means over scenarios, with their standard errors.
+
+    Attributes:
+        moves_per_hour: of all inputs together.
+        error_ratio: mean tracking error over that of plain MPC in the same scenarios.
+        plain_moves_per_hour: of plain MPC.
+        scenarios: how many they are means over.
+    """
+
+    moves_per_hour: Estimate
+    error_ratio: Estimate
+    plain_moves_per_hour: Estimate
+    scenarios: int
+
+    def __str__(self) -> str:
+        moves, error, plain = self.moves_per_hour, self.error_ratio, self.plain_moves_per_hour
+        return (
+            f"{moves.value:.3g} moves per hour (standard error {moves.standard_error:.2g}; plain MPC "
+            f"{plain.value:.3g}) at {error.value:.3f} times the error of plain MPC (standard error "
+            f"{error.standard_error:.2g}): means over {self.scenarios} scenarios, from which a single run may differ"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrontPoint:
+    """One price of the controller chosen: means over the scenarios of the second round, with standard errors."""
+
+    price: float
+    moves_per_hour: Estimate
+    error_ratio: Estimate
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """What `tune` found.
+
+    Attributes:
+        problem: what the controller solves.
+        rules: its move rules; `rules.price` is the price chosen.
+        expected: the promise, a mean over scenarios with its standard error.
+        front: the prices of this controller that no other of them beats in moves and error, by rising error.
+        reached: whether what was asked for is kept by fewer moves than those of plain MPC.
+        baseline: plain MPC, which errors are compared with.
+        noise: of the outputs, shape (l,), as assumed or told.
+        drift: that the estimator expects, times the noise.
+        loads: of the scenarios, which took them in turn.
+        rows: every run of the second round, as a sweep writes them.
+    """
+
+    problem: TrackingProblem
+    rules: MoveRules
+    expected: Expected
+    front: tuple[FrontPoint, ...]
+    reached: bool
+    baseline: Regulator = field(repr=False)
+    noise: Array = field(repr=False)
+    drift: float = field(repr=False)
+    loads: tuple[Any, ...] = field(repr=False)
+    rows: list[dict[str, Any]] = field(repr=False)
+
+    @property
+    def regulator(self) -> Regulator:
+        """The controller found, with its estimator."""
+        return self.at_price(self.rules.price)
+
+    def at_price(self, price: float) -> Regulator:
+        """The same with another price; 0 for none."""
+        if self._is_plain:
+            return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.baseline.estimator)
+        return Candidate("", self.problem, self.drift, self.noise).regulator(price)
+
+    @property
+    def _is_plain(self) -> bool:
+        return self.problem is self.baseline.controller.problem
+
+
+def tune(
+    model: StateSpace,
+    *,
+    limits: Limits | None = None,
+    max_error_increase: float | None = None,
+    max_moves_per_hour: float | None = None,
+    output_weight: Any = 1.0,
+    noise: Any = None,
+    reference_changes: Any = None,
+    loads: Any = None,
+    baseline: Regulator | None = None,
+    seed: int = 0,
+    jobs: int = -1,
+    progress: bool | None = None,
+    on_task: Callable[[int, int], None] = lambda done, total: None,
+) -> Tuned:
+    """The controller that moves least often at an error that one allows, from a model and limits.
+
+    The promise is a mean over scenarios, with its standard error: on plants off the model by up to 15 % in each gain,
+    lag and dead time, with set-points, noise and loads as told or assumed, the mean tracking error plus half its
+    standard error is at most 1 + `max_error_increase` times that of plain MPC in the same scenarios. A single run may
+    exceed it.
+
+    Args:
+        model: a discrete model.
+        limits: of inputs and outputs; those of `baseline` where that is given.
+        max_error_increase: 0.25 for a quarter more than plain MPC's mean of (y - r)' Q (y - r); the default, 0.25,
+            unless moves per hour are given.
+        max_moves_per_hour: of all inputs together, in place of it; the error is then as small as they allow.
+        output_weight: Q; see `TrackingProblem`.
+        noise: standard deviation of the measurement noise, scalar or (l,); default `model.noise`, else a 500th of
+            what the inputs' whole range does to an output.
+        reference_changes: set-points differ from the operating point by up to these, scalar or (l,), output units;
+            default what 3 % of the inputs' range does.
+        loads: of `mampc.loads`, all in every scenario, () for none; default steps, a random walk, coloured noise and
+            none in turn, sized by noise and gain.
+        baseline: a regulator with plain MPC to compare with, whose horizons, weights and limits hold; default from
+            the model's settling time.
+        seed: equal seeds give equal results.
+        jobs: processes, -1 for one a core.
+        progress: as in `simulate`.
+        on_task: called with the number of finished and of all tasks.
+
+    Raises:
+        MampcError: values that do not fit, two goals, or inputs without limits where sizes are derived from them.
+    """
+    goal = _goal(max_error_increase, max_moves_per_hour)
+    as_whole("seed", seed, 0)
+    plain = _plain(model, limits, output_weight, baseline)
+    problem = plain.controller.problem
+    around = Surroundings.of(problem, noise, reference_changes, loads)
+    found = candidates(problem, around.noise)
+    total = len(found) + FINALISTS + 3
+    bar = iter(watched(total, progress))
+    done = iter(range(1, total + 1))
+
+    def tell() -> None:
+        next(bar, None)
+        on_task(next(done), total)
+
+    first, base = _drawn(plain, around, SEARCHED, (seed, 1))
+    goal = replace(goal, hours=first.hours)
+    tell()
+    scale = float(base.error.mean()) * problem.prediction_horizon
+    prices = [scale * factor for factor in np.geomspace(*SEARCH_SPAN, SEARCH_PRICES).tolist()]
+    ranked: list[tuple[float, int, float]] = []
+    for number, points in enumerate(_each([(c, prices) for c in found], first, jobs)):
+        worth, price = goal.at_aim(points, base)
+        ranked.append((worth, number, price))
+        tell()
+    ranked.sort()
+    second, base = _drawn(plain, around, REFINED, (seed, 2))
+    tell()
+    span = np.geomspace(1 / REFINE_SPAN, REFINE_SPAN, REFINE_PRICES)
+    tasks = [(found[number], (price * span).tolist()) for _, number, price in ranked[:FINALISTS]]
+    finalists = []
+    for (candidate, _), points in zip(tasks, _each(tasks, second, jobs), strict=True):
+        finalists.append((*goal.at_aim(points, base), candidate, points))
+        tell()
+    finalists.sort(key=lambda finalist: finalist[0])
+    rows = rows_of(
+        [base, *(point for *_, points in finalists for point in points)], base.method, second.hours
+    )
+    last, last_base = _drawn(plain, around, CONFIRMED, (seed, 3))
+    chosen, price, point, reached = _confirmed(goal, finalists, last, last_base)
+    tell()
+    next(bar, None)
+    expected = Expected(
+        moves_per_hour(point, last.hours), error_ratio(point, last_base), moves_per_hour(last_base, last.hours),
+        len(last),
+    )  # fmt: skip
+    front: tuple[FrontPoint, ...] = ()
+    if chosen is not None:
+        own = next(points for *_, candidate, points in finalists if candidate is chosen)
+        front = _front(own, base, second.hours)
+    return Tuned(
+        problem if chosen is None else chosen.problem, MoveRules(price=price), expected, front, reached, plain,
+        around.noise, np.nan if chosen is None else chosen.drift, around.loads, rows,
+    )  # fmt: skip
+
+
+def _goal(max_error_increase: float | None, max_moves_per_hour: float | None) -> Goal:
+    if max_moves_per_hour is None:
+        given = 0.25 if max_error_increase is None else max_error_increase
+        return Goal(as_number("max_error_increase", given, 0.0, exclusive=True), None)
+    if max_error_increase is not None:
+        raise MampcError("tune: expected one of max_error_increase and max_moves_per_hour, received both")
+    return Goal(None, as_number("max_moves_per_hour", max_moves_per_hour, 0.0, exclusive=True))
+
+
+def _plain(
+    model: StateSpace, limits: Limits | None, output_weight: Any, baseline: Regulator | None
+) -> Regulator:
+    """Plain MPC to compare with."""
+    if not isinstance(model, StateSpace):
+        raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
+    if baseline is None:
+        if limits is None:
+            raise MampcError("limits: expected mampc.Limits with u_min and u_max, received none")
+        if not model.is_discrete:
+            raise MampcError("model: expected a discrete model, received dt = 0; use model.discretise(dt)")
+        problem = usual_problem(model, limits, output_weight)
+        return Regulator(MPC(problem), KalmanFilter.offset_free(model))
+    if not isinstance(baseline, Regulator) or type(baseline.controller) is not MPC:
+        raise MampcError(f"baseline: expected a mampc.Regulator with plain MPC, received {baseline!r}")
+    if baseline.controller.problem.model is not model:
+        raise MampcError("baseline: expected a regulator of the same model, received one of another")
+    if limits is not None:
+        raise MampcError("limits: expected those of the baseline, received others beside it")
+    return baseline
+
+
+def candidates(problem: TrackingProblem, noise: Array) -> list[Candidate]:
+    """All that are compared, for a problem of plain MPC."""
+    m, n_p = problem.model.n_inputs, problem.prediction_horizon
+    n_c = int(np.clip(MOST_MOVES // m, 1, min(CONTROL_HORIZON, n_p)))
+    found = []
+    for share in MOVE_WEIGHTS:
+        for tail in (0, n_p):
+            sparse = replace(
+                problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail
+            )
+            for drift in DRIFTS:
+                name = f"drift {drift:g}, move weight x {share:g}, tail {tail}"
+                candidate = Candidate(name, sparse, drift, noise)
+                try:
+                    candidate.regulator(1.0)
+                except MampcError:  # such as a tail that an unstable model does not have
+                    continue
+                found.append(candidate)
+    if not found:
+        raise MampcError(
+            "tune: expected a model that a sparse controller and a Kalman filter can be built for"
+        )
+    return found
+
+
+def _drawn(
+    plain: Regulator, around: Surroundings, count: int, seed: tuple[int, int]
+) -> tuple[Scenarios, Point]:
+    """Scenarios, and plain MPC in them."""
+    scenarios = Scenarios.drawn(plain, around, count, seed)
+    base = Point("plain MPC", 0.0, *scenarios.run(plain))
+    if not np.isfinite(base.error).all() or not base.error.mean() > 0:
+        raise MampcError(
+            "tune: expected a model that plain MPC with these horizons, weights and limits controls, received one on "
+            "which it runs away; give a baseline that works"
+        )
+    return scenarios, base
+
+
+def _each(
+    tasks: Sequence[tuple[Candidate, list[float]]], scenarios: Scenarios, jobs: int
+) -> Iterator[list[Point]]:
+    """The points of each task, in their order, as they finish."""
+    if jobs == 1 or len(tasks) == 1:
+        for candidate, prices in tasks:
+            yield candidate.points(prices, scenarios)
+        return
+    from joblib import Parallel, delayed
+
+    parallel = Parallel(n_jobs=jobs, return_as="generator", max_nbytes=None)
+    yield from parallel(delayed(candidate.points)(prices, scenarios) for candidate, prices in tasks)
+
+
+def _confirmed(
+    goal: Goal, finalists: Sequence[Any], scenarios: Scenarios, base: Point
+) -> tuple[Candidate | None, float, Point, bool]:
+    """The first finalist that keeps what is allowed in scenarios that nothing was chosen by; else the calmest.
+
+    The price goes back until the mean and half its standard error are within what is allowed.
+    """
+    calmest: tuple[Candidate | None, float, Point] = (None, 0.0, base)
+    for _, price, candidate, _ in finalists:
+        for _ in range(TRIES):
+            (point,) = candidate.points([price], scenarios)
+            used = goal.used(point, base)
+            if used.value + 0.5 * used.standard_error <= 1:
+                if point.moves.mean() < base.moves.mean():
+                    return candidate, price, point, True
+                break
+            if goal.max_error_increase is None and point.moves.mean() < calmest[2].moves.mean():
+                calmest = candidate, price, point
+            price *= goal.back
+    return *calmest, False
+
+
+def _front(points: Sequence[Point], base: Point, hours: float) -> tuple[FrontPoint, ...]:
+    moves, errors = np.array([p.moves.mean() for p in points]), np.array([p.error.mean() for p in points])
+    return tuple(
+        FrontPoint(points[i].value, moves_per_hour(points[i], hours), error_ratio(points[i], base))
+        for i in non_dominated(moves, errors).tolist()
+    )
+
+
+def rows_of(points: Sequence[Point], plain: str, hours: float) -> list[dict[str, Any]]:
+    """Runs as a sweep writes them, of points of which one is plain MPC."""
+    return [
+        {
+            "scenario": "tuning", "controller": point.method,
+            "method": "mpc" if point.method == plain else "exact", "value": point.value, "seed": loop,
+            "moves": moves, "error": error, "moves_per_hour": moves / hours,
+        }
+        for point in points
+        for loop, (moves, error) in enumerate(zip(point.moves.tolist(), point.error.tolist(), strict=True))
+    ]  # fmt: skip

@@ -1,0 +1,200 @@
+"""Tuning by one knob: what it promises, and on which models."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import tank_model
+from mampc.compare import scenarios, tuning
+from mampc.compare.scenarios import settling, usual_problem
+
+SMALL = {
+    "SEARCHED": 3, "REFINED": 4, "CONFIRMED": 6, "SEARCH_PRICES": 3, "REFINE_PRICES": 4, "DRIFTS": (0.3,),
+    "MOVE_WEIGHTS": (0.1,),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_and_short():
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in SMALL.items():
+            patch.setattr(tuning, name, value)
+        patch.setattr(scenarios, "LENGTHS", (80, 80))
+        yield
+
+
+def lag(**changes):
+    settings = {"gain": [[2.0]], "time_constant": 50.0, "dt": 10.0}
+    return mampc.StateSpace.from_first_order(**(settings | changes))
+
+
+def tuned(model, **settings):
+    settings = {"limits": mampc.Limits(u_min=-10.0, u_max=10.0), "jobs": 1, "progress": False} | settings
+    return mampc.tune(model, **settings)
+
+
+@pytest.fixture(scope="module")
+def tank():
+    limits = mampc.Limits(u_min=0.0, u_max=100.0)
+    return tuned(tank_model(), limits=limits, noise=0.1, reference_changes=2.0)
+
+
+def test_the_promise_is_kept_as_a_mean_on_plants_that_were_not_seen(tank):
+    model = tank_model()
+    assert tank.reached
+    expected = tank.expected
+    assert expected.error_ratio.value + 0.5 * expected.error_ratio.standard_error <= 1.25
+    assert expected.moves_per_hour.value < 0.2 * expected.plain_moves_per_hour.value
+    seeds = range(1000, 1012)
+    plants = [mampc.Mismatch(gain=0.15, lag=0.15, dead_time=0.15).drawn(model, seed) for seed in seeds]
+    levels = model.y_op + np.random.default_rng(7).uniform(-1, 1, (12, 4, 2)) * [2.0, 2.0]
+    reference = np.repeat(levels, 20, axis=1)
+    loops = {"seeds": seeds, "noise": tank.noise, "progress": False}
+    errors = [
+        mampc.simulate_batch(plants, regulator, reference, **loops).metrics().tracking_error
+        for regulator in (tank.regulator, tank.baseline)
+    ]
+    ratio = errors[0].mean() / errors[1].mean()
+    spread = (errors[0] - ratio * errors[1]).std(ddof=1) / np.sqrt(12) / errors[1].mean()
+    assert ratio - 2 * spread <= 1.25
+
+
+def test_what_is_found_can_be_used_at_other_prices(tank):
+    assert tank.regulator.controller.rules == tank.rules
+    assert tank.rules.price > 0
+    assert tank.problem.control_horizon == 3
+    calm = tank.at_price(10 * tank.rules.price)
+    assert calm.controller.rules.price == 10 * tank.rules.price
+    assert [point.error_ratio.value for point in tank.front] == sorted(
+        point.error_ratio.value for point in tank.front
+    )
+    assert "means over 6 scenarios" in str(tank.expected)
+    assert "standard error" in str(tank.expected)
+
+
+def test_a_seed_decides_everything():
+    a, b, c = (tuned(lag(), seed=seed) for seed in (3, 3, 4))
+    assert a.rules == b.rules
+    assert a.rows == b.rows
+    assert a.expected == b.expected
+    assert a.rows != c.rows
+
+
+@pytest.mark.parametrize("noise", [None, 0.05])
+def test_units_decide_nothing(noise):
+    model = tank_model()
+    of_u, of_y = np.array([4.0, 0.125]), np.array([2.0, 64.0])  # powers of two: the same digits
+    scaled = replace(
+        model, B=model.B / of_u, C=model.C * of_y[:, None], D=model.D * of_y[:, None] / of_u,
+        u_op=model.u_op * of_u, y_op=model.y_op * of_y,
+    )  # fmt: skip
+    low, high = np.zeros(2), np.full(2, 100.0)
+    a = tuned(model, limits=mampc.Limits(u_min=low, u_max=high), noise=noise)
+    b = tuned(
+        scaled, limits=mampc.Limits(u_min=low * of_u, u_max=high * of_u), output_weight=1 / of_y**2,
+        noise=None if noise is None else noise * of_y,
+    )  # fmt: skip
+    assert b.rules.price == pytest.approx(a.rules.price, rel=1e-6)
+    assert b.expected.moves_per_hour.value == pytest.approx(a.expected.moves_per_hour.value, rel=1e-6)
+    assert b.expected.error_ratio.value == pytest.approx(a.expected.error_ratio.value, rel=1e-6)
+    np.testing.assert_allclose(b.noise, a.noise * of_y, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.diag(b.problem.move_weight), np.diag(a.problem.move_weight) / of_u**2, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        lag(gain=[[0.01]], time_constant=np.inf, dead_time=20.0),
+        lag(dead_time=80.0),
+        mampc.StateSpace.from_first_order(  # a lag that answers the wrong way first
+            gain=[[3.0, -1.0], [0.5, 2.0], [1.0, 1.0]], time_constant=[[60, 10], [40, 50], [30, 30]], dt=10.0
+        ),
+    ],
+    ids=["integrating", "delayed", "more outputs than inputs"],
+)
+def test_every_kind_of_model_is_tuned(model):
+    found = tuned(model)
+    assert found.expected.error_ratio.value <= 1.25
+    assert found.expected.moves_per_hour.value < found.expected.plain_moves_per_hour.value
+
+
+def test_the_horizon_covers_what_step_responses_take_to_settle():
+    assert settling(lag()) == pytest.approx(50 / 10 * np.log(20), abs=1)
+    assert settling(lag(dead_time=80.0)) == settling(lag()) + 8
+    assert settling(lag(time_constant=np.inf)) <= 2
+    problem = usual_problem(lag(dead_time=80.0), mampc.Limits(), 1.0)
+    assert problem.prediction_horizon == settling(lag()) + 8
+    assert usual_problem(lag(time_constant=1e5), mampc.Limits(), 1.0).prediction_horizon == 60
+
+
+def test_moves_per_hour_can_be_asked_for():
+    found = tuned(lag(), max_moves_per_hour=40.0)
+    assert found.reached
+    moves = found.expected.moves_per_hour
+    assert moves.value + 0.5 * moves.standard_error <= 40
+
+
+def test_what_cannot_be_reached_is_told_and_the_calmest_is_given(monkeypatch):
+    monkeypatch.setattr(tuning, "SEARCH_SPAN", (1e-3, 1e-2))
+    monkeypatch.setattr(tuning, "TRIES", 2)
+    found = tuned(lag(), max_moves_per_hour=1e-3)
+    assert not found.reached
+    assert found.expected.moves_per_hour.value < found.expected.plain_moves_per_hour.value
+    assert found.at_price(1.0).controller.rules.price == 1.0
+
+
+def test_where_nothing_keeps_the_allowance_plain_mpc_stays(monkeypatch):
+    monkeypatch.setattr(tuning, "TRIES", 0)
+    found = tuned(lag())
+    assert not found.reached
+    assert found.rules.price == 0
+    assert found.problem is found.baseline.controller.problem
+    assert found.expected.error_ratio.value == 1
+    assert found.front == ()
+    decision = found.regulator.step(found.regulator.initial_state(), [0.0], [1.0])
+    assert np.isfinite(decision.u).all()
+
+
+def test_loads_and_reference_changes_may_be_told_where_inputs_have_no_limits():
+    found = tuned(
+        lag(),
+        limits=mampc.Limits(),
+        noise=0.1,
+        reference_changes=1.0,
+        loads=[mampc.loads.RandomWalk(size=0.02)],
+    )
+    assert found.reached
+    assert [[load.size for load in kind] for kind in found.loads] == [[0.02]]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"max_error_increase": 0.1, "max_moves_per_hour": 3.0}, "one of max_error_increase"),
+        ({"max_error_increase": 0.0}, "max_error_increase: expected a finite number above 0"),
+        ({"max_moves_per_hour": -1}, "max_moves_per_hour"),
+        ({"limits": None}, "limits: expected mampc.Limits"),
+        ({"limits": mampc.Limits(u_min=0.0)}, "u_min and u_max"),
+        ({"noise": [0.1, 0.1, 0.1]}, "noise"),
+        ({"noise": 0.0}, "noise: expected positive"),
+        ({"reference_changes": -1.0}, "reference_changes"),
+        ({"loads": [3]}, "loads"),
+        ({"loads": 3}, "loads"),
+        ({"seed": -1}, "seed"),
+        ({"baseline": "mpc"}, "baseline"),
+    ],
+)
+def test_what_does_not_fit_is_told(settings, words):
+    with pytest.raises(mampc.MampcError, match=words):
+        tuned(lag(), **settings)
+
+
+def test_no_model_and_continuous_models_are_refused():
+    with pytest.raises(mampc.MampcError, match="model: expected"):
+        tuned("model.json")
+    with pytest.raises(mampc.MampcError, match="discrete"):
+        tuned(mampc.StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], 0.0))
