@@ -167,3 +167,11 @@ def test_records_that_do_not_belong_together_are_refused():
         n4sid([first, other])
     with pytest.raises(MampcError, match="expected a record"):
         n4sid([])
+
+
+def test_stages_are_told():
+    told = []
+    n4sid(pieces(2), feedthrough=False, progress=told.append)
+    assert told[0] == "looking for dead times"
+    assert "all of the record" in told[-1]
+    assert any("ARX" in stage for stage in told)

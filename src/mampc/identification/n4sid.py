@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -106,6 +106,7 @@ def n4sid(
     unstable: str = "auto",
     detrend: str = "auto",
     delays: Any = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Identified:
     """Identify a state-space model from one record or several of the same plant.
 
@@ -128,6 +129,7 @@ def n4sid(
             sample to sample; "auto" takes what predicts held-out data best, the simplest if that is alike.
         delays: dead times in samples, beyond the one of every sampled plant, a scalar or (l, m + d); by
             default those that show in the record, if they exceed `SHORT` and predict held-out data.
+        progress: is told each stage in a few words; long records with many signals take some seconds.
 
     Raises:
         MampcError: a record too short, constant signals, or an unstable model with unstable="refuse".
@@ -146,13 +148,15 @@ def n4sid(
     records = scaled(given, centred=detrend != "none")
     settings = Settings(order, weighting, s, feedthrough, unstable)
     dead = _given_delays(delays, l, m, min(lengths))
+    tell = progress if progress is not None else (lambda stage: None)
     values: list[Array] = []
     if unstable == "auto" and detrend != "none" and dead is None and _keeps_unstable(records, settings):
         choice = _Choice("constant", np.zeros((l, m), dtype=int), predictor=True, notes=(UNSTABLE,))
         part, errors_ahead = estimate_predictor(records, feedthrough, order)
         parts, noise = [part], Noise(errors_ahead * records.y_spread, np.zeros(l))
     else:
-        choice = _chosen(records, settings, detrend, dead)
+        choice = _chosen(records, settings, detrend, dead, tell)
+        tell("identifying a model on all of the record")
         parts = _parts(records, settings, choice, values)
         noise = _noise(parts, records)
     model = replace(assembled(parts, records, first), noise=noise)
@@ -185,6 +189,11 @@ class _Choice:
     rival: bool = False
     predictor: bool = False
     notes: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        late = "with dead times" if self.delays.any() else "without dead times"
+        return f"{'ARX' if self.rival else 'subspace'} models, trend: {self.trend}, {late}"
 
 
 class _Score(NamedTuple):
@@ -253,10 +262,13 @@ def _parts(
     return parts
 
 
-def _chosen(records: Scaled, settings: Settings, detrend: str, delays: Integers | None) -> _Choice:
+def _chosen(
+    records: Scaled, settings: Settings, detrend: str, delays: Integers | None, tell: Callable[[str], None]
+) -> _Choice:
     """Trend, dead times and rival by what predicts the held-out part of the records."""
     m, l = records.u[0].shape[1], records.y[0].shape[1]
     none = np.zeros((l, m), dtype=int)
+    tell("looking for dead times")
     found = find_delays(records.u, records.y) if delays is None else delays
     if delays is None and found.max() <= SHORT:
         found = none
@@ -264,6 +276,7 @@ def _chosen(records: Scaled, settings: Settings, detrend: str, delays: Integers 
     notes: list[str] = []
 
     def scored(choice: _Choice) -> _Score:
+        tell(f"trying {choice.words}")
         try:
             s = _block_rows([len(u) - int(choice.delays.max()) for u in front.u], m, l, settings.order, None)
             trial = replace(settings, block_rows=min(s, settings.block_rows))

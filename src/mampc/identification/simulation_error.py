@@ -15,7 +15,8 @@ from mampc.base.checks import Array
 from mampc.identification.scaling import Scaled
 from mampc.identification.triangular import fold, solve
 
-_ENTRIES = 2**22  # numbers taken into the triangular factor at once, 32 MB
+_CORRELATED = 2**16  # samples whose autocorrelation is looked at
+_ENTRIES = 2**20  # numbers taken into the triangular factor at once, 8 MB
 
 
 class Trend(NamedTuple):
@@ -194,7 +195,8 @@ def independent_samples(residuals: Sequence[Array]) -> float:
     N / (1 + 2 sum of the autocorrelations up to where they first vanish), summed over outputs.
     """
     total = 0.0
-    for residual in residuals:
+    for whole in residuals:
+        residual = whole[:_CORRELATED]
         N = len(residual)
         centred = residual - residual.mean(axis=0)
         spectrum = np.fft.rfft(centred, 2 * N, axis=0)
@@ -203,5 +205,5 @@ def independent_samples(residuals: Sequence[Array]) -> float:
             if column[0] <= 0:
                 continue
             first = int(np.argmax(column <= 0)) or N
-            total += N * column[0] / (column[0] + 2 * column[1:first].sum())
+            total += len(whole) * column[0] / (column[0] + 2 * column[1:first].sum())
     return total

@@ -73,7 +73,7 @@ def identify_and_write(
     require_writable(target)
     estimation, rest = hold_out(long_enough(records, notes), share)
     show("identifying a model")
-    identified = n4sid(estimation if len(estimation) > 1 else estimation[0], **settings)
+    identified = n4sid(estimation if len(estimation) > 1 else estimation[0], progress=show, **settings)
     validation = identified.validate(rest)
     show("estimating how certain it is")
     identified = replace(
