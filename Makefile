@@ -12,7 +12,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: demo test deep coverage fuzz lint format bench methods figures lock clean help
+.PHONY: demo test deep coverage fuzz lint format bench methods attention figures lock clean help
 .DEFAULT_GOAL := help
 
 help:  ## what can be made
@@ -48,6 +48,9 @@ bench: .venv/dev.stamp  ## speed, as ratios measured side by side
 
 methods: .venv/dev.stamp  ## compare all methods on random instances, and renew their table in docs/methods.md
 	$(BIN)/python benchmarks/methods.py --markdown
+
+attention: .venv/dev.stamp  ## moves at equal error on every plant, load and method; renew docs/comparison.md
+	$(BIN)/python benchmarks/attention.py
 
 figures: .venv/run.stamp  ## redraw the figures of the documentation
 	$(BIN)/python docs/draw_figures.py
