@@ -1,6 +1,7 @@
 """The command line: what it prints, writes, refuses and returns."""
 
 import json
+import signal
 import subprocess
 import sys
 
@@ -226,3 +227,17 @@ def test_scattered_bad_values_do_not_spoil_a_model(tmp_path):
         assert words in done.stdout
         identified = mampc.StateSpace.load(tmp_path / "a.json")
         assert mampc.validate(identified, mampc.IOData(u, y, 10.0)).fit[0] > 90
+
+
+def test_an_interruption_says_what_was_kept_and_exits_with_130(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mampc", "run", "quadruple-tank", "--out", "out"],
+        cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    said = process.stderr.readline()  # the first stage has begun
+    process.send_signal(signal.SIGINT)
+    said += process.stderr.read()
+    assert process.wait() == 130
+    assert "mampc: interrupted; what had finished is written" in said
+    assert "Traceback" not in said

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -21,8 +22,17 @@ app = typer.Typer(
 )
 
 
+class Interrupted(BaseException):
+    """Ctrl-C, under a name that no library on the way takes for its own."""
+
+
+def _interrupt(*_: Any) -> None:
+    raise Interrupted
+
+
 def main() -> None:
-    """Run the command line; complaints go to standard error and exit with 2."""
+    """Run the command line; complaints go to standard error and exit with 2, an interruption with 130."""
+    signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
     except (MampcError, OSError) as error:  # OSError: such as a name longer than any file's
@@ -31,7 +41,7 @@ def main() -> None:
         )
         Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"mampc: {expected}{error}")
         sys.exit(2)
-    except KeyboardInterrupt:
+    except Interrupted:
         print("mampc: interrupted; what had finished is written", file=sys.stderr)
         sys.exit(130)
 
