@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
 FLOAT = np.dtype(np.float64)
 LARGEST = 1e12  # in engineering units; beyond it a number is a fault, and double precision has little left
+T = TypeVar("T")
 
 
 def is_usable(vector: Array) -> bool:
@@ -128,6 +129,13 @@ def as_whole(name: str, value: Any, minimum: int, maximum: int | None = None) ->
             f"{name}: expected a whole number of at least {minimum}{upto}, received {shown(value)}"
         )
     return int(value)
+
+
+def as_instance(name: str, value: Any, kind: type[T]) -> T:
+    """A value of one of our classes; raises `MampcError` for anything else."""
+    if not isinstance(value, kind):
+        raise MampcError(f"{name}: expected a mampc.{kind.__name__}, received {type(value).__name__}")
+    return value
 
 
 def as_flag(name: str, value: Any) -> bool:

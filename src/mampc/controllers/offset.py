@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mampc.base.checks import Array
+from mampc.base.checks import Array, as_instance
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
@@ -28,6 +28,8 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     the model has fewer inputs than outputs (or poles at one), or the rules may forbid to move all inputs
     at once (`max_moves`, `max_moves_per_step`), by less than `min_size`, or at any sample (`blocks`).
     """
+    problem = as_instance("problem", problem, TrackingProblem)
+    rules = as_instance("rules", rules, MoveRules)
     model, L = problem.model, problem.tail_horizon
     m, l = model.n_inputs, model.n_outputs
     admissible = AdmissiblePatterns(rules, m, problem.control_horizon)

@@ -348,7 +348,7 @@ def _given_delays(delays: Any, l: int, m: int, shortest: int) -> Integers | None
 
 
 def _records(data: IOData | Sequence[IOData]) -> list[IOData]:
-    records = [data] if isinstance(data, IOData) else list(data)
+    records: list[Any] = list(data) if isinstance(data, (list, tuple)) else [data]
     if not records or not all(isinstance(record, IOData) for record in records):
         raise MampcError("n4sid: expected a record (IOData) or several, received something else")
     first = records[0]

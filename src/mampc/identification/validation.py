@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mampc.base.checks import Array
+from mampc.base.checks import Array, as_instance
 from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
 from mampc.identification.simulation_error import filtered, states
@@ -50,6 +50,7 @@ def validate(model: StateSpace, data: IOData, *, drift: bool = False) -> Validat
     Raises:
         MampcError: another sample time or number of signals than the model's.
     """
+    model, data = as_instance("model", model, StateSpace), as_instance("data", data, IOData)
     if not np.isclose(model.dt, data.dt, rtol=1e-6):
         raise MampcError(f"validate: expected a record sampled every {model.dt:g} s, received {data.dt:g} s")
     if (data.u.shape[1], data.y.shape[1]) != (model.B.shape[1], model.n_outputs):

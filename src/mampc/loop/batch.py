@@ -11,6 +11,7 @@ import numpy as np
 from mampc.base.checks import LARGEST, Array, BoolArray, as_array, as_flag, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
+from mampc.base.progress import watched
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.loop.batched_plans import BatchedPlans, batched_plans
 from mampc.loop.estimation import Estimate, KalmanFilter
@@ -20,7 +21,7 @@ from mampc.loop.motion import Faults, motions_of
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.sensors import SensorState
-from mampc.loop.simulation import Acting, Course, acting_on, at_rest, closed_loop, watched
+from mampc.loop.simulation import Acting, Course, acting_on, at_rest, closed_loop
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.plants import Plant

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from mampc.base.checks import Array, as_array, as_matrix, as_vector, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
+from mampc.base.progress import watched
 from mampc.loop.loads import Load, drawn
 from mampc.loop.motion import Faults, motion_of
 from mampc.loop.regulator import Regulator
@@ -20,6 +20,8 @@ from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Stems, Valves
 from mampc.plants import Plant
 from mampc.systems.state_space import StateSpace
+
+LONGEST_RUN = 10_000_000  # samples
 
 
 def simulate(
@@ -232,7 +234,7 @@ def at_rest(
 
 def _length(reference: Array, steps: int | None) -> int:
     if steps is not None:
-        return as_whole("steps", steps, 1)
+        return as_whole("steps", steps, 1, LONGEST_RUN)
     if reference.ndim != 2:
         raise MampcError(
             "steps: expected a number of samples, since the reference is constant, received none"
@@ -250,36 +252,9 @@ def _trajectory(name: str, value: Any, width: int, steps: int | None) -> Array:
     if array.ndim < 2:
         if steps is None:
             raise MampcError(f"steps: expected a number of samples, since {name} is constant")
-        return np.tile(as_vector(name, array, width), (as_whole("steps", steps, 1), 1))
+        return np.tile(as_vector(name, array, width), (as_whole("steps", steps, 1, LONGEST_RUN), 1))
     rows = as_matrix(name, array, None, width)
-    steps = len(rows) if steps is None else as_whole("steps", steps, 1)
+    steps = len(rows) if steps is None else as_whole("steps", steps, 1, LONGEST_RUN)
     if len(rows) == 0:
         raise MampcError(f"{name}: expected at least one row, received none")
     return rows[np.minimum(np.arange(steps), len(rows) - 1)]
-
-
-def watched(steps: int, progress: bool | None) -> Any:
-    """0..steps-1, with a progress bar that shows itself once the run has taken two seconds."""
-    if progress is False:
-        return range(steps)
-    return _with_bar(steps, 0.0 if progress else 2.0)
-
-
-def _with_bar(steps: int, patience: float) -> Any:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    began, bar, task = time.perf_counter(), None, None
-    try:
-        for k in range(steps):
-            if bar is None and console.is_terminal and time.perf_counter() - began >= patience:
-                bar = Progress(console=console, transient=True)
-                bar.start()
-                task = bar.add_task("closed loop", total=steps, completed=k)
-            yield k
-            if bar is not None and task is not None:
-                bar.update(task, completed=k + 1)
-    finally:
-        if bar is not None:
-            bar.stop()

@@ -51,7 +51,7 @@ class MoveRules:
         if self.max_moves is not None:
             as_whole("max_moves", self.max_moves, 0)
         as_whole("sparsity_horizon", self.sparsity_horizon, 1, 10_000)
-        if self.counting not in COUNTINGS:
+        if not isinstance(self.counting, str) or self.counting not in COUNTINGS:
             raise MampcError(f"counting: expected one of {COUNTINGS}, received {self.counting!r}")
         as_whole("dwell", self.dwell, 1, 10_000)
         if self.max_moves_per_step is not None:
