@@ -14,12 +14,12 @@ import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError
+from mampc.base.progress import watched
 from mampc.compare.fronts import FEWEST, Estimate, Point, non_dominated
 from mampc.compare.scenarios import Scenarios, Surroundings, usual_problem
 from mampc.controllers import MAMPC, MPC
 from mampc.loop.estimation import KalmanFilter
 from mampc.loop.regulator import Regulator
-from mampc.loop.simulation import watched
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.state_space import StateSpace
