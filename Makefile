@@ -12,7 +12,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: demo test deep coverage fuzz lint format bench methods attention figures lock clean help
+.PHONY: demo test deep coverage fuzz lint format bench conditioning methods attention figures lock clean help
 .DEFAULT_GOAL := help
 
 help:  ## what can be made
@@ -45,6 +45,9 @@ format: .venv/dev.stamp  ## put the code in shape
 
 bench: .venv/dev.stamp  ## speed, as ratios measured side by side
 	$(BIN)/python benchmarks/bench.py
+
+conditioning: .venv/dev.stamp  ## 2000 badly conditioned problems against brute force in 60 digits
+	$(BIN)/python benchmarks/conditioning.py
 
 methods: .venv/dev.stamp  ## compare all methods on random instances, and renew their table in docs/methods.md
 	$(BIN)/python benchmarks/methods.py --markdown

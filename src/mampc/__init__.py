@@ -4,7 +4,7 @@ See README.md for ten lines that run, docs/ for the rest.
 """
 
 from mampc import plants, rivals
-from mampc.base.errors import MampcError, StudyError
+from mampc.base.errors import MampcError, MampcWarning, StudyError
 from mampc.base.names import Names
 from mampc.base.words import Fault, LoadKind, Remark, Status
 from mampc.compare.tuning import Tuned, tune
@@ -69,6 +69,7 @@ __all__ = [
     "LoadBank",
     "LoadKind",
     "MampcError",
+    "MampcWarning",
     "Metrics",
     "Mismatch",
     "MoveRules",

@@ -9,6 +9,10 @@ class MampcError(ValueError):
     """An argument, file or model that mampc cannot work with."""
 
 
+class MampcWarning(UserWarning):
+    """What works, but not as well as it should."""
+
+
 class StudyError(MampcError):
     """A study file with a wrong key, type, value or unit; the message names each place."""
 

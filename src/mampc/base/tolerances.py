@@ -6,6 +6,8 @@ as `prefix` gives it: an actuator's resolution does not depend on where it stand
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 
 from mampc.base.checks import Array
@@ -17,12 +19,15 @@ ROUNDING = 1e-8  # a smaller planned move may be none
 NOTHING = 1e-11  # a smaller planned move is none, and the others need not make up for it
 SMALLER = 1e-8  # a move that falls short of its least size by no more is rounded up to it
 URGENT = 1e-6  # scaled violation: what suspending the rules has to gain at least
+CERTAIN = 1e-9  # of the optimum: what a proof may be wrong by
 TIE = 1e-10  # of the optimum: plans nearer than this are equally good
 
 # What is dropped at once is no move, and every move is looked at before it counts.
 assert NOTHING < SAME <= ROUNDING
 # An input that goes back to its limit by no more has not moved.
 assert max(KEPT, INSIDE) <= SAME
+# Equally good plans do not spoil a proof.
+assert TIE < CERTAIN
 # A move rounded up to its least size is one.
 assert SAME < SMALLER
 
@@ -34,7 +39,12 @@ def tie(objective: float, rounding: float = 0.0) -> float:
         objective: a sum of squares, not negative.
         rounding: of the length whose square it is.
     """
-    return TIE * objective + (2 * objective**0.5 + rounding) * rounding if objective < float("inf") else 0.0
+    return TIE * objective + left_open(objective, rounding) if objective < float("inf") else 0.0
+
+
+def left_open(objective: float, rounding: float) -> float:
+    """How far an objective may be from the truth, a sum of squares whose root is known to within `rounding`."""
+    return (2 * sqrt(objective) + rounding) * rounding
 
 
 def prefix(curvature: Array, width: Array) -> Array:

@@ -54,6 +54,10 @@ class Remark(Sentence):
         "The moves already made exceed the budget of their window: no further move is planned.",
     )
     BACK_INSIDE = "back_inside", "The applied inputs were outside their limits and go back inside."
+    ROUNDING = (
+        "rounding",
+        "The prediction enlarges rounding so much that the optimum is known no better than to within the gap.",
+    )
     RULES_SUSPENDED = (
         "rules_suspended",
         "The move rules were suspended: under them an output would leave its limits by more than the margin.",

@@ -15,7 +15,7 @@ from mampc.base.tolerances import INSIDE, SAME
 from mampc.base.words import Remark, Status
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.controllers.way_back import way_back
-from mampc.methods.method import HELD_BY, Plan
+from mampc.methods.method import HELD_BY, Plan, doubted
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import PatternSolver
 from mampc.moves.rules import MoveRules
@@ -177,6 +177,8 @@ class Controller(ABC):
             plan = self._to_hold(plan, sample, state, limits_now.inputs)
         elif plan.objective is None or plan.inputs is None or self._may_leave(limits_now):
             plan = self._completed(plan, plan.moves, sample, state, limits_now.inputs)
+        if sample is not None and self.condensed.ill_conditioned:
+            plan = doubted(plan, self.condensed, sample)
         return self._decision(plan, state, limits_now.inputs, start)
 
     def manual_inputs(self, manual: Any) -> BoolArray | None:

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.base.tolerances import CERTAIN, left_open
 from mampc.base.words import Remark, Status
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
@@ -40,6 +41,19 @@ class Plan(NamedTuple):
     active: Array | None = None
     memory: Array | None = None
     violations: Array | None = None
+
+
+def doubted(plan: Plan, condensed: CondensedQP, sample: Sample) -> Plan:
+    """The plan with a bound that rounding cannot break, where this is looser than a proof may be."""
+    objective = plan.objective
+    bound = objective if plan.lower_bound is None else plan.lower_bound
+    if objective is None or bound is None or bound == -np.inf:
+        return plan
+    doubt = left_open(objective, condensed.rounding(sample))
+    if doubt <= CERTAIN * objective:
+        return plan
+    status = Status.FEASIBLE if plan.status is Status.OPTIMAL else plan.status
+    return plan._replace(status=status, lower_bound=bound - doubt, remarks=(*plan.remarks, Remark.ROUNDING))
 
 
 class Search(Protocol):

@@ -20,12 +20,13 @@ On a move pattern S (all other moves zero) the optimum without limits is affine 
 
 from __future__ import annotations
 
+import warnings
 from functools import cached_property
 
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, ComplexArray
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, MampcWarning
 from mampc.base.tolerances import prefix
 from mampc.program.bounds import Bounds
 from mampc.program.parameter import Parameter
@@ -37,6 +38,7 @@ from mampc.program.sample import Indices, LeastSquares, Parts, PatternOptimum, S
 from mampc.program.tail import square_root, tail
 
 ROUNDING = 1e-15  # of what a sum adds up: how far it may be from the truth
+ILL_CONDITIONED = 1e7  # condition, or growth of predictions, from which on a proof has to look at rounding
 SINGULAR = 1e13  # condition of U, of unit columns, from which on rounding determines some move
 
 
@@ -53,6 +55,8 @@ class CondensedQP:
         condition: of U with columns of length 1, so that units do not count.
         input_prefix: power of a thousand in which each input is a number of ordinary size, shape (m,).
         move_prefix: the same for every move, shape (n_moves,).
+        growth: how many times larger the outputs that a state predicts become than they are at first.
+        ill_conditioned: whether rounding may decide; a `MampcWarning` says so when the problem is made.
         parameter: where each quantity stands in p.
         bounds: which quantities are bounded, and between what.
         theta: predicted outputs per move, shape ((np + 1) l, n_moves).
@@ -99,6 +103,17 @@ class CondensedQP:
         width = problem.limits.u_max - problem.limits.u_min
         self.input_prefix = prefix(np.square(self.U[:, :m]).sum(axis=0), width)
         self.move_prefix = np.tile(self.input_prefix, n_c)
+        self.growth = self._growth(problem.model.n_states, problem.model.n_outputs)
+        self.ill_conditioned = max(self.condition, self.growth) > ILL_CONDITIONED
+        if self.ill_conditioned:
+            warnings.warn(
+                f"TrackingProblem: predictions over {problem.prediction_horizon} samples have a condition of "
+                f"{self.condition:.0e} and grow {self.growth:.0e} times, which enlarges rounding as much; decisions "
+                "say what that leaves open in their gap. Shorten the prediction horizon, give moves a larger weight, "
+                "or predict with a model that is stabilised",
+                MampcWarning,
+                stacklevel=3,
+            )
 
         f = parameter.no_map(v + n)
         f[:v, parameter.one] = problem.output_limit_weight
@@ -136,6 +151,12 @@ class CondensedQP:
         lost = Q.T @ rest  # what rounding left in the range of W
         self._target += lost
         self._free_residual: Array = np.asarray(np.linalg.qr(rest - Q @ lost, mode="r"))
+
+    def _growth(self, n: int, l: int) -> float:
+        """How many times larger the outputs that a state predicts become than over the first n + 1 samples."""
+        of_state = self._error[:, self.parameter.x]
+        first, all_of_them = (np.linalg.norm(rows, axis=0) for rows in (of_state[: (n + 1) * l], of_state))
+        return float(np.max(all_of_them[first > 0] / first[first > 0], initial=1.0))
 
     def _optimum_maps(self, restriction: Restriction) -> dict[str, Array]:
         """The optimum without limits on a pattern: its margins, moves, inputs and residual as maps of p."""

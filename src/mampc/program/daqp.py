@@ -25,6 +25,7 @@ _STATUS = {
 ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
 ROUNDING = 5e-9  # relative to the sizes of the data: how far an optimum may miss its conditions
 ORDINARY = 1e8  # length of f: up to here what daqp calls an optimum is one, and only longer ones are checked
+GONE = 1e18  # a bound beyond it is none, in whatever units
 EVEN = 5  # powers of two: units of variables and rows that are this near to even ones are left alone
 LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
@@ -99,7 +100,7 @@ class DaqpSolver:
             changed["sense"] = active
         elif active is not None:
             # A bound that went away since cannot be started from.
-            there = np.where(active == ACTIVE_BELOW, lower > -UNBOUNDED, upper < UNBOUNDED)
+            there = np.where(active == ACTIVE_BELOW, lower > -GONE, upper < GONE)
             changed["sense"] = np.where(there, active, 0).astype(np.intc)
         flag = model.update(**changed)
         if flag < 0:

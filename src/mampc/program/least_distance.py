@@ -10,6 +10,7 @@ of the optimum is a sum of squares.
 
 from __future__ import annotations
 
+from functools import cached_property
 from math import frexp, isfinite
 from typing import NamedTuple
 
@@ -17,7 +18,13 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.program.daqp import DaqpSolver
-from mampc.program.qp import UNBOUNDED, QPStatus, QuadraticProgram
+from mampc.program.qp import QPSolution, QPStatus, QuadraticProgram
+from mampc.program.refinement import refined
+
+SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
+UNCERTAIN = 1e-10  # of the excess: what a solver's slack may be worth before the solution is refined
+DOUBTFUL = 1e4  # condition of R from which on what a solver calls infeasible is looked at again
+MOST_ROUNDS = 100  # of a refinement
 
 
 class Nearest(NamedTuple):
@@ -60,6 +67,7 @@ class LeastDistance:
         time_limit: float | None = None,
     ) -> None:
         v, k = violations.shape[1], len(R)
+        self._R, self._violations = R, violations
         self._v, self._weight, self._rows, self._n_simple = v, weight, np.ascontiguousarray(rows), n_simple
         self._inverse = np.linalg.solve(R, np.eye(k))
         self._per_violation = np.sqrt(2 / weight)  # of its coordinate in which its curvature is 2 as well
@@ -67,37 +75,88 @@ class LeastDistance:
         length = np.sqrt(np.square(A).sum(axis=1))
         # Powers of two change no digit.
         even = 2.0 ** -np.round(np.log2(np.where(length > 0, length, 1.0)))
-        self._A = A * even[:, None]
+        self._A, self._even_rows = A * even[:, None], rows * even[:, None]
         self._even = np.concatenate([np.full(v, 1 / self._per_violation), even])
         self._f = np.concatenate([np.full(v, weight * self._per_violation), np.zeros(k)])
-        self._solver = DaqpSolver(QuadraticProgram(2 * np.eye(v + k), self._A, v), time_limit=time_limit)
+        self._solver = DaqpSolver(
+            QuadraticProgram(2 * np.eye(v + k), self._A, v), time_limit=time_limit, tolerance=SLACK
+        )
 
     def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
         """The best moves, given the optimum without limits, shape (k,), and all bounds, shape (v + b,)."""
         low, high = self._from_optimum(optimum, lower, upper)
-        if active is not None:  # a bound that went away since cannot be started from
-            active = np.where(
-                (active > 1) & (lower <= -UNBOUNDED) | (active == 1) & (upper >= UNBOUNDED), 0.0, active
-            )
-        scale = self._scale(low, high)
+        f, scale, v = self._f, self._scale(low, high), self._v
+        if scale != 1.0:
+            f = f / scale
+            low /= scale
+            high /= scale
         self._solver.start(active)
-        solution = self._solver.solve(self._f / scale, low / scale, high / scale)
-        if solution.z is None or solution.multipliers is None:
+        solution = self._solver.solve(f, low, high)
+        z, pull = solution.z, solution.multipliers
+        if z is None or pull is None:
+            if (
+                solution.status in (QPStatus.INFEASIBLE, QPStatus.FAILED, QPStatus.ITERATION_LIMIT)
+                and self._doubtful
+            ):
+                return self._tried_again(optimum, lower, upper, solution)
             return Nearest(None, np.inf, None, solution.status, solution.iterations)
-        v, z = self._v, solution.z * scale
-        delta, excess, violated = z[v:], 0.0, False
-        if v and z[:v].max() > 0:
-            violated = True
-            a = np.maximum(z[:v] * self._per_violation, 0.0)
-            excess = self._weight * float(a.sum() + 0.5 * a.dot(a))
-        excess += float(delta.dot(delta))
-        multipliers = solution.multipliers * self._even * scale
+        delta = z[v:] * scale
+        excess, violated = float(delta.dot(delta)), bool(v and z[:v].max() > 0)
+        if violated:
+            excess += self._penalty(z[:v] * (scale * self._per_violation))
+        multipliers = pull * (scale * self._even)
+        if self._doubtful:
+            slack = np.where(pull > 0, high, low)[v:] - self._A.dot(z)
+            if scale * scale * np.abs(pull[v:]).dot(np.abs(slack)) > UNCERTAIN * excess:
+                return self._refined(optimum, lower, upper, multipliers, solution.iterations)
         moves = optimum + self._inverse.dot(delta)
-        simple = slice(v, v + self._n_simple)
-        pull = multipliers[simple]
-        at_bound = np.where(pull > 0, upper[simple], lower[simple])
-        moves[: self._n_simple] = np.where(pull == 0, moves[: self._n_simple], at_bound)
+        for i in np.flatnonzero(pull[v : v + self._n_simple]):
+            moves[i] = upper[v + i] if pull[v + i] > 0 else lower[v + i]
         return Nearest(moves, excess, multipliers, solution.status, solution.iterations, violated)
+
+    def _penalty(self, violations: Array) -> float:
+        a = np.maximum(violations, 0.0)
+        return self._weight * float(a.sum() + 0.5 * a.dot(a))
+
+    @cached_property
+    def _doubtful(self) -> bool:
+        """Whether a solver may fail for the condition of R, though there are moves within bounds."""
+        length = np.linalg.norm(self._R, axis=0)
+        return bool(len(length) and np.linalg.cond(self._R / length) > DOUBTFUL)
+
+    @cached_property
+    def _in_moves(self) -> DaqpSolver:
+        """The shortest moves within bounds, which is a question that R does not enter."""
+        v, k = self._v, len(self._R)
+        A = np.hstack([self._violations, self._rows])
+        return DaqpSolver(QuadraticProgram(np.eye(v + k), A, v))
+
+    def _tried_again(self, optimum: Array, lower: Array, upper: Array, failed: QPSolution) -> Nearest:
+        """What a solver failed at, from no active bounds on; INFEASIBLE only if there are no moves within bounds."""
+        self._in_moves.start()
+        if self._in_moves.solve(np.zeros(len(self._f)), lower, upper).status is QPStatus.INFEASIBLE:
+            return Nearest(None, np.inf, None, QPStatus.INFEASIBLE, failed.iterations)
+        return self._refined(optimum, lower, upper, np.zeros(len(lower)), failed.iterations)
+
+    def _refined(
+        self, optimum: Array, lower: Array, upper: Array, multipliers: Array, iterations: int
+    ) -> Nearest:
+        """The solution made exact from active bounds, those that multipliers tell; FAILED where that does not end."""
+        v, k, root = self._v, len(self._R), np.sqrt(self._weight / 2)
+        F, A = np.zeros((v + k, v + k)), np.zeros((len(lower), v + k))
+        F[:v, :v], F[v:, v:] = root * np.eye(v), self._R
+        A[:v, :v], A[v:, :v], A[v:, v:] = np.eye(v), self._violations, self._rows
+        reached = self._R.dot(optimum)
+        c = np.concatenate([np.full(v, -root), reached])
+        better = refined(F, c, A, lower, upper, multipliers, MOST_ROUNDS)
+        if better is None:
+            return Nearest(None, np.inf, None, QPStatus.FAILED, iterations)
+        moves = better.z[v:]
+        delta = self._R.dot(moves) - reached
+        excess, violated = float(delta.dot(delta)), bool(v and better.z[:v].max() > 0)
+        if violated:
+            excess += self._penalty(better.z[:v])
+        return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated)
 
     def relaxed(self, optimum: Array, lower: Array, upper: Array, multipliers: Array) -> tuple[Array, float]:
         """The optimum with limits priced by multipliers: its delta, and its cost beyond that of the optimum without."""
@@ -112,11 +171,9 @@ class LeastDistance:
 
     def _from_optimum(self, optimum: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
         """The bounds as distances from the optimum."""
-        low, high, reached = lower.copy(), upper.copy(), self._rows.dot(optimum)
+        low, high, reached = lower * self._even, upper * self._even, self._even_rows.dot(optimum)
         low[self._v :] -= reached
         high[self._v :] -= reached
-        low *= self._even
-        high *= self._even
         return low, high
 
     def _scale(self, low: Array, high: Array) -> float:
