@@ -1,5 +1,6 @@
 """docs/data.md: its commands run on its export, and do what the page says."""
 
+import json
 import shlex
 import sys
 from pathlib import Path
@@ -30,7 +31,7 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("ugly_export", None)
 
 
-def test_the_commands_lead_from_the_export_to_a_model(folder):
+def test_the_commands_lead_from_the_export_to_a_running_study(folder):
     assert len(commands()) >= 3
     for command in commands():
         outcome = CliRunner().invoke(app, command)
@@ -39,6 +40,10 @@ def test_the_commands_lead_from_the_export_to_a_model(folder):
     assert (model.dt, model.n_inputs, model.n_outputs) == (10.0, 2, 2)
     assert dict(model.names.units)["LI-1.PV"] == "cm"
     assert (folder / "export-columns.png").exists()
+    summary = json.loads((folder / "results" / "tank" / "summary.json").read_text())
+    assert not summary["warnings"]
+    mpc, price = summary["scenarios"][0]["controllers"][:2]
+    assert price["moves"] < mpc["moves"] / 10
 
 
 def test_the_python_of_the_page_runs(folder):

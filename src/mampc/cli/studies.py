@@ -125,20 +125,49 @@ def reproduce(
 
 
 @app.command()
-def new(path: Annotated[Path, typer.Argument(help="File to write; must not exist yet.")]) -> None:
-    """Write a commented study to start your own from.
+def new(
+    path: Annotated[Path, typer.Argument(help="File to write; must not exist yet.")],
+    model: Annotated[
+        Path | None, typer.Option("--model", "-m", help="A model file; the study is made for its plant.")
+    ] = None,
+) -> None:
+    """Write a study to start your own from: a commented example, or with --model one that fits your plant.
 
-    Example:
+    With a model, limits, weights, horizons, reference, price and noise come from it and from what its record
+    said; what nobody told is marked as a placeholder.
+
+    Examples:
 
         mampc new my-study.toml && mampc run my-study.toml
+
+        mampc new column.toml --model column.json
     """
+    from mampc.base.files import written_whole
     from mampc.study import template
 
+    if path.exists():
+        raise MampcError(f"new: expected a file that does not exist yet, received {path}")
+    text = template() if model is None else _own_study(path, model)
+    with written_whole(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+    console_for_tables().print(
+        f"Wrote {path}; edit it, then run: mampc run {path}", soft_wrap=True, markup=False
+    )
+
+
+def _own_study(path: Path, model: Path) -> str:
+    """The text of a study at a path, of a model file that it names relative to its folder where it can."""
+    from mampc.study import parse_study
+    from mampc.study.own import own_study
+    from mampc.systems.state_space import StateSpace
+
+    loaded = StateSpace.load(model)
+    folder, place = path.resolve().parent, model.resolve()
+    inside = place.is_relative_to(folder)
+    file = place.relative_to(folder).as_posix() if inside else str(place)
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(template())
-    except FileExistsError:
-        raise MampcError(f"new: expected a file that does not exist yet, received {path}") from None
-    except OSError as error:
-        raise MampcError(f"new: expected a file that can be written, received: {error}") from None
-    console_for_tables().print(f"Wrote {path}; edit it, then run: mampc run {path}", soft_wrap=True)
+        text = own_study(loaded, file, path.stem[:80])
+    except MampcError as error:
+        raise MampcError(f"{model}: {error}") from None
+    parse_study(text, str(path), folder=folder)
+    return text

@@ -53,3 +53,18 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
         return nothing
     offset: Array = np.sqrt(admissible.charge(all_at_once) * np.diag(np.linalg.inv(kept)))
     return offset
+
+
+def largest_saving(condensed: CondensedQP, change: Array) -> float:
+    """The most cost that any moves can save at rest after the reference changes by `change`, shape (l,).
+
+    It is what the optimum without limits and prices saves of the cost of holding the inputs. Where a single move
+    is priced higher, none is ever made.
+    """
+    held = condensed.error_of_reference @ change
+    theta = condensed.weighted_theta
+    H = theta.T @ theta + condensed.R
+    size = np.sqrt(np.diag(H))
+    unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)  # so that no input's unit counts
+    g = unit * (theta.T @ held)
+    return float(g @ np.linalg.lstsq(unit[:, None] * H * unit, g)[0])

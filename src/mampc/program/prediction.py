@@ -60,7 +60,7 @@ class Prediction:
 
         of_all_inputs = self.step_response.reshape(-1, model.B.shape[1])
         self.free = free = parameter.no_map((n_p + 1) * l)
-        free[:, parameter.x] = observed.reshape(-1, model.n_states)
+        free[:, parameter.x] = observed.reshape(len(free), model.n_states)
         free[:, parameter.u_deviation] = free[:, parameter.input_disturbance] = of_all_inputs[:, :m]
         free[:, parameter.measured_disturbance] = of_all_inputs[:, m:]
         free[:, parameter.output_disturbance] = np.tile(np.eye(l), (n_p + 1, 1))

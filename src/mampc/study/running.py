@@ -25,9 +25,9 @@ from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.moves.rules import MoveRules
 from mampc.plants import Plant
-from mampc.program.condensing import CondensedQP
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.rivals.registry import RIVALS, rival
+from mampc.study.cautions import cautions
 from mampc.study.plugins import make_plant
 from mampc.study.schema import (
     ControllerTable,
@@ -107,7 +107,7 @@ def run_study(
             run = run_controller(study, prepared, scenario, regulators[table.name])
             runs[scenario.name][table.name] = run
             on_run(scenario.name, table.name, run)
-    warnings = _warnings(study, prepared.model) + _faults(runs)
+    warnings = cautions(study, _problem(study, prepared.model), _reference(study, prepared)) + _faults(runs)
     return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings)
 
 
@@ -333,19 +333,6 @@ def _reference(study: Study, prepared: Prepared) -> Array:
     if isinstance(plant, StateSpace):
         return staircase + plant.response(usual[None], plant.steady_state(usual))
     return staircase + np.asarray(plant.output(plant.steady_state(usual), usual))
-
-
-def _warnings(study: Study, model: StateSpace) -> tuple[str, ...]:
-    problem = _problem(study, model)
-    radius = float(np.abs(CondensedQP(problem).closed_loop_poles()).max())
-    if radius < 1.0 + 1e-6:  # inputs that can stand in for one another leave a pole at 1, which is harmless
-        return ()
-    return (
-        f"the closed loop without limits is unstable: spectral radius {radius:.3f} "
-        f"at dt = {study.dt:g} s with horizons "
-        f"{problem.prediction_horizon} and {problem.control_horizon}; "
-        "lengthen the prediction horizon or the sample time, or raise move_weight",
-    )
 
 
 def _faults(runs: dict[str, dict[str, Run]]) -> tuple[str, ...]:

@@ -50,6 +50,8 @@ def read(path: str | Path) -> StateSpace:
     try:
         names = Names(**{k: tuple(v) for k, v in content["names"].items()})
         matrices = {k: content[k] for k in ("A", "B", "C", "D", "dt", "u_op", "y_op")}
+        if matrices["A"] == []:  # no states: JSON keeps no empty rows
+            matrices |= {"A": np.zeros((0, 0)), "B": np.zeros((0, np.shape(matrices["D"])[-1]))}
         noise = Noise(**content["noise"]) if "noise" in content else None
         evidence = Evidence(**content["evidence"]) if "evidence" in content else None
         v_op = content.get("v_op", 0.0)

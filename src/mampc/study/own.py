@@ -1,0 +1,325 @@
+"""A study of one's own: everything in it comes from a model and from what its record said.
+
+Outputs count in units of the change of reference that is asked of them, inputs in units of what they do to the outputs,
+and prices in units of what moves save, so that no unit decides.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError
+from mampc.controllers.offset import largest_offset, largest_saving
+from mampc.moves.rules import MoveRules
+from mampc.program.condensing import CondensedQP
+from mampc.program.problem import MOST_PREDICTIONS, Limits, TrackingProblem
+from mampc.systems.properties import Properties, properties, time_in_words
+from mampc.systems.state_space import StateSpace
+
+LONGEST_HORIZON = 100  # samples; beyond it the tail counts
+SHORTEST_HORIZON = 10
+ASKED = 0.3  # of what inputs can hold: the change of reference
+GUESSED_NOISE = 0.02  # of that change, where no record told
+MOST_CHANGES = 4  # of single outputs
+PRICE = 1 / 16  # of what moves save after such a change: changes of a quarter of it are still worth them
+DEAD_BAND = 0.01  # of the inputs' range
+LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
+EFFORT = 0.1  # of the error that an input's change makes, in one sample: what its move costs
+
+
+class Draft(NamedTuple):
+    """What is chosen for a study; changes are from the operating point, one row each."""
+
+    problem: TrackingProblem
+    changes: Array
+    every: int
+    price: float
+    noise: Array
+    known_limits: bool
+    known_noise: bool
+
+
+def own_study(model: StateSpace, file: str, name: str) -> str:
+    """The commented text of a study of a model, which stands in for the plant.
+
+    Args:
+        model: discrete.
+        file: of the model, as the study names it.
+        name: of the study.
+
+    Raises:
+        MampcError: a continuous model, or one whose outputs no input moves.
+    """
+    found = properties(model)
+    return _text(model, found, draft(model, found), file, name)
+
+
+def draft(model: StateSpace, found: Properties) -> Draft:
+    """Limits, horizons, weights, reference, price and noise."""
+    low, high, known = _input_limits(model)
+    m, l = model.n_inputs, model.n_outputs
+    settling = int(np.ceil(found.settling_time / model.dt))
+    dead = int(np.ceil(found.dead_time[:, :m].max(initial=0.0) / model.dt))
+    moves = 5 if m < 3 else 4 if m == 3 else 3
+    horizon = min(max(settling, SHORTEST_HORIZON), LONGEST_HORIZON)
+    horizon = min(max(horizon, dead + 2 * moves), MOST_PREDICTIONS // l)
+    gain = _held_gain(model, found, horizon)
+    if not gain.any():
+        raise MampcError("expected a model whose inputs move an output, received one where none does")
+    changes = _reachable(gain, model.u_op - low, high - model.u_op)
+    asked = np.abs(changes).max(axis=0)
+    # Outputs that none of the changes concerns weigh as little as what inputs do to them says.
+    asked = np.where(asked > 0, asked, np.maximum((np.abs(gain) @ (high - low)) * ASKED, 1e-300))
+    output_weight = _rounded(1 / np.where(asked > 1e-300, asked, 1.0) ** 2)
+    move_weight = _rounded(_positive(EFFORT * output_weight @ gain**2))
+    tail = 0.0 if found.unstable else float(horizon)  # what grows has no tail
+    problem = TrackingProblem(
+        model, prediction_horizon=horizon, control_horizon=min(moves, horizon), output_weight=output_weight,
+        move_weight=move_weight, limits=Limits(u_min=low, u_max=high), tail_horizon=tail,
+    )  # fmt: skip
+    problem = _stable(problem)
+    known_noise = model.noise is not None and bool((model.noise.output > 0).any())
+    noise = model.noise.output if known_noise and model.noise is not None else GUESSED_NOISE * asked
+    every = min(max(int(1.5 * settling) + dead, 20), 2 * LONGEST_HORIZON)
+    return Draft(problem, changes, every, _price(problem, changes), _rounded(noise), known, known_noise)
+
+
+def _input_limits(model: StateSpace) -> tuple[Array, Array, bool]:
+    """Limits about the operating point, and whether they are those of a record."""
+    m = model.n_inputs
+    if model.evidence is not None:
+        low, high = model.evidence.inputs[:m].T.copy()
+        span = high - low
+        if (span > 0).all():
+            low, high = np.minimum(low, model.u_op - 0.1 * span), np.maximum(high, model.u_op + 0.1 * span)
+            step = 10.0 ** np.floor(np.log10(span) - 2)
+            return np.floor(low / step) * step, np.ceil(high / step) * step, True
+    span = np.where(model.u_op == 0, 1.0, np.abs(model.u_op) / 2)
+    return model.u_op - span, model.u_op + span, False
+
+
+def _held_gain(model: StateSpace, found: Properties, horizon: int) -> Array:
+    """What held inputs do, (l, m): steady; over the horizon where an output integrates."""
+    m = model.n_inputs
+    gain = found.gain
+    if found.unstable and not found.integrators:
+        gain = model.dc_gain()  # of the steady state that a controller can hold
+    gain = np.where(np.isfinite(gain), gain, 0.0)
+    rows = found.integrating.any(axis=1, keepdims=True)
+    held: Array = np.where(rows, np.where(found.integrating, gain * horizon * model.dt, 0.0), gain)[:, :m]
+    return held
+
+
+def _reachable(gain: Array, down: Array, up: Array) -> Array:
+    """Changes of one output each, as far as inputs can hold them; where that is not possible, what one input does.
+
+    Args:
+        gain: of `_held_gain`.
+        down, up: how far each input can go, shape (m,).
+    """
+    l, m = gain.shape
+    room = np.minimum(down, up)
+    room = np.where(room > 0, room, np.maximum(down, up))
+    scaled = gain * room
+    size = np.where(scaled.any(axis=1), np.abs(scaled).max(axis=1), 1.0)[:, None]
+    scaled = scaled / size
+    moved = scaled.any(axis=1)
+    if np.linalg.matrix_rank(scaled[moved], tol=1e-6) == moved.sum():
+        directions = np.zeros((m, l))
+        directions[:, moved] = np.linalg.pinv(scaled[moved])
+        directions = directions[:, moved]
+    else:
+        directions = np.eye(m)[:, scaled.any(axis=0)]
+    shares = directions.T * room  # input changes, one row a change
+    changes = []
+    for share in shares[:MOST_CHANGES]:
+        reach = [_reach(sign * share, down, up) for sign in (1.0, -1.0)]
+        sign = 1.0 if reach[0] >= reach[1] else -1.0
+        change = gain @ (ASKED * max(reach) * sign * share)
+        changes.append(
+            np.where(np.abs(change) > 1e-9 * np.abs(change / size[:, 0]).max() * size[:, 0], change, 0.0)
+        )
+    found = _rounded(np.array(changes))
+    return found[found.any(axis=1)]
+
+
+def _reach(change: Array, down: Array, up: Array) -> float:
+    """How many times inputs can take this change."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = np.where(change > 0, up / change, np.where(change < 0, -down / change, np.inf))
+    return float(times.min())
+
+
+def _stable(problem: TrackingProblem) -> TrackingProblem:
+    """With moves that cost more, as far as it takes a closed loop that is stable without limits."""
+    for _ in range(8):
+        if np.abs(CondensedQP(problem).closed_loop_poles()).max() < 1 + 1e-6:
+            break
+        problem = TrackingProblem(
+            problem.model, prediction_horizon=problem.prediction_horizon, control_horizon=problem.control_horizon,
+            output_weight=problem.output_weight, move_weight=_rounded(4 * problem.move_weight),
+            limits=problem.limits, tail_horizon=problem.tail_horizon,
+        )  # fmt: skip
+    return problem
+
+
+def _price(problem: TrackingProblem, changes: Array) -> float:
+    """A price that pays after every change, and leaves at most half of it where `largest_offset` promises anything."""
+    condensed, m = CondensedQP(problem), problem.model.n_inputs
+    price = PRICE * min(largest_saving(condensed, change) for change in changes) / m
+    offset = largest_offset(problem, MoveRules(price=price))
+    asked = np.where(changes != 0, np.abs(changes), np.inf).min(axis=0)
+    share = offset[np.isfinite(asked)] / asked[np.isfinite(asked)]
+    if np.isfinite(share).all() and share.max() > LEFT:
+        price *= float(LEFT / share.max()) ** 2
+    return float(f"{price:.2g}")
+
+
+def _rounded(values: Array, digits: int = 2) -> Array:
+    """To so many digits each."""
+    flat = [float(f"{value:.{digits}g}") for value in np.ravel(values)]
+    rounded: Array = np.reshape(flat, np.shape(values))
+    return rounded
+
+
+def _positive(values: Array) -> Array:
+    """Zeros, of inputs that do nothing, replaced by the largest of the others."""
+    return np.where(values > 0, values, values.max(initial=0.0) or 1.0)
+
+
+def _text(model: StateSpace, found: Properties, plan: Draft, file: str, name: str) -> str:
+    problem, names = plan.problem, model.names
+    limits, changes = problem.limits, [*plan.changes, np.zeros(model.n_outputs)]
+    first = 5
+    steps = first + plan.every * len(changes)
+    settled = time_in_words(found.settling_time)
+    threshold = float(f"{0.002 * np.min(limits.u_max - limits.u_min):.1g}")
+    limit_note = (
+        "the range of the record; the valves' own may be wider"
+        if plan.known_limits
+        else "PLACEHOLDERS about the operating point: put in those of the plant"
+    )
+    noise_note = "as found in the record" if plan.known_noise else "a PLACEHOLDER: what the sensors have"
+    return f"""# A mampc study of the model {_words([file])}, in engineering units. Run it with `mampc run THIS-FILE`;
+# `mampc new other.toml` writes a study in which every key is explained.
+#
+# inputs: {_words(names.inputs)}
+# outputs: {_words(names.outputs)}
+
+name = {_string(name)}
+steps = {steps}
+dt = {_number(model.dt)}  # seconds, as the model's
+threshold = {_number(threshold)}  # input changes above it count as moves in the first table
+skip = {first}
+
+[plant]
+kind = "model"  # the model stands in for the plant
+
+[model]
+file = {_string(file)}
+
+[problem]
+prediction_horizon = {problem.prediction_horizon}  # samples; the model settles within {settled}
+control_horizon = {problem.control_horizon}
+tail_horizon = {_number(problem.tail_horizon)}  # samples that a lasting error counts for beyond the prediction horizon
+output_weight = {_list(np.diag(problem.output_weight))}  # 1 / (the change of reference below)^2
+move_weight = {_list(np.diag(problem.move_weight))}  # by what inputs do to outputs
+# Limits of the inputs are {limit_note}.
+limits = {{ u_min = {_list(limits.u_min)}, u_max = {_list(limits.u_max)} }}  # also du_max, y_min, y_max
+{_output_ranges(model)}
+[reference]
+relative = true  # from the operating outputs {_some(model.y_op)}
+initial = {_list(np.zeros(model.n_outputs))}
+changes = [
+{_changes(changes, first, plan.every)}
+]
+
+[[scenarios]]
+name = "noise-free"
+
+[[scenarios]]
+name = "noisy"
+noise = {_list(plan.noise)}  # standard deviation, output units: {noise_note}
+seed = 0
+{_loads(model, plan)}# Scenarios may have loads, valves, a plant off the model: mismatch = {{ gain = 0.2, lag = 0.2 }}
+
+[[controllers]]
+name = "MPC"
+method = "mpc"
+
+# A move must save this much; changes of the reference save {round(1 / PRICE)} times as much for each input, or more.
+[[controllers]]
+name = "price"
+method = "exact"
+rules = {{ price = {_number(plan.price)} }}
+
+[[controllers]]
+name = "lower price"
+method = "exact"
+rules = {{ price = {_number(plan.price / 4)} }}
+
+# What one would use instead: moves below a size are left out.
+[[controllers]]
+name = "dead band"
+method = "dead_band"
+settings = {{ size = {_list(_rounded(DEAD_BAND * (limits.u_max - limits.u_min)))} }}
+"""
+
+
+def _loads(model: StateSpace, plan: Draft) -> str:
+    """A scenario with the random walk that the record showed."""
+    if model.noise is None or not model.noise.drift.any():
+        return ""
+    return f"""
+[[scenarios]]
+name = "with loads"
+noise = {_list(plan.noise)}
+seed = 0
+# Outputs wandered like this in the record, by loads, drifts and what the model lacks: standard deviation in a sample.
+loads = [{{ kind = "random_walk", at = "output", size = {_list(_rounded(model.noise.drift))} }}]
+"""
+
+
+def _output_ranges(model: StateSpace) -> str:
+    if model.evidence is None:
+        return ""
+    low, high = model.evidence.outputs.T
+    return f"# The record's outputs ran from {_some(low)} to {_some(high)}.\n"
+
+
+def _changes(changes: Sequence[Array], first: int, every: int) -> str:
+    return "\n".join(
+        f"  {{ at = {first + k * every}, value = {_list(change)} }}," for k, change in enumerate(changes)
+    )
+
+
+def _list(values: Array) -> str:
+    return "[" + ",\n  ".join(
+        ", ".join(map(_number, values[k : k + 8])) for k in range(0, len(values), 8)
+    ) + "]"  # fmt: skip
+
+
+def _some(values: Array) -> str:
+    """The first values, for a comment."""
+    return ", ".join(f"{value:.5g}" for value in values[:8]) + (", ..." if len(values) > 8 else "")
+
+
+def _number(value: float) -> str:
+    """As few digits as give the same number back, up to rounding."""
+    return repr(float(f"{value:.12g}") + 0.0)
+
+
+def _string(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _words(names: Sequence[str]) -> str:
+    """Names as a comment can hold them."""
+    shown = [re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", " ", name)[:80] for name in names[:20]]
+    return ", ".join(shown) + (f" and {len(names) - 20} more" if len(names) > 20 else "")

@@ -1,0 +1,177 @@
+"""`mampc new --model`: a study of one's own that runs at once; and what a study warns of."""
+
+import errno
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import mampc
+from mampc import StateSpace
+from mampc.cli import app
+from mampc.study import load_study, parse_study, template
+from mampc.study.own import own_study
+from mampc.study.running import run_study
+from mampc.systems.evidence import Evidence
+from mampc.systems.noise import Noise
+
+lags = StateSpace.from_first_order
+MODELS = {
+    "delayed": lags(
+        gain=[[12.8, -18.9], [6.6, -19.4]],
+        time_constant=[[16.7, 21.0], [10.9, 14.4]],
+        dead_time=[[1, 3], [7, 3]],
+        dt=3.0,
+    ),
+    "level": lags(
+        gain=[[1e-3, -1e-3]], time_constant=np.inf, dead_time=[[60.0, 0.0]], dt=30.0, u_op=50.0, y_op=3.0,
+        names=mampc.Names(("feed",), ('level "A"\\',), disturbances=("draw",)),
+    ),
+    "unstable": StateSpace([[1.05]], [[0.5]], [[1.0]], None, 1.0),
+    "fewer inputs": lags(gain=[[1.0], [-2.0], [0.0]], time_constant=[[10.0], [30.0], [1.0]], dt=4.0),
+    "more inputs": lags(gain=[[1.0, 2.0, 0.0]], time_constant=[[10.0, 20.0, 30.0]], dt=4.0),
+    "at once": StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[3.0]], 1.0),
+}  # fmt: skip
+
+
+def ran(model, folder, **changes):
+    model.save(folder / "model.json")
+    study = parse_study(own_study(model, "model.json", "own"), folder=folder)
+    return run_study(study.model_copy(update=changes))
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_it_runs_at_once_and_its_price_pays(kind, tmp_path):
+    result = ran(MODELS[kind], tmp_path)
+    assert result.warnings == ()
+    runs = result.runs["noise-free"]
+    assert all(status in ("optimal", "feasible") for run in runs.values() for status in run.statuses)
+    mpc, price = (runs[name].metrics() for name in ("MPC", "price"))
+    assert 0 < np.sum(price.moves) <= np.sum(mpc.moves)
+    still = np.mean(np.sum((runs["MPC"].r - MODELS[kind].y_op) ** 2, axis=1))
+    assert mpc.tracking_error < 0.8 * still
+    assert price.tracking_error < 0.9 * still
+
+
+@pytest.mark.parametrize("units", [1e-8, 1e-3, 1e6])
+def test_units_decide_nothing(units, tmp_path):
+    model = MODELS["delayed"]
+    rows, columns = np.array([[1.0], [units]]), np.array([units, 1.0])
+    span = np.array([[0.0, 4.0], [-1.0, 2.0]])
+    ranges = Evidence(span, [[0.0, 9.0], [0.0, 9.0]])
+    scaled_ranges = Evidence(span / columns[:, None], [[0.0, 9.0], [0.0, 9.0 * units]])
+    scaled = StateSpace(
+        model.A, model.B * columns, rows * model.C, None, 3.0, [1.0 / units, 0.5], evidence=scaled_ranges
+    )
+    plain = replace(model, u_op=[1.0, 0.5], evidence=ranges)
+    one, other = (tomllib.loads(own_study(m, "m.json", "own")) for m in (plain, scaled))
+    for key in ("prediction_horizon", "control_horizon"):
+        assert one["problem"][key] == other["problem"][key]
+    for a, b in zip(one["reference"]["changes"], other["reference"]["changes"], strict=True):
+        np.testing.assert_allclose(b["value"], rows[:, 0] * a["value"], rtol=0.02)
+    prices = [study["controllers"][1]["rules"]["price"] for study in (one, other)]
+    np.testing.assert_allclose(*prices, rtol=0.1)  # numbers are rounded to two digits
+
+
+def test_what_the_record_said_is_in_it():
+    model = replace(
+        MODELS["delayed"],
+        u_op=[50.0, 40.0],
+        noise=Noise([0.1, 0.2], [0.01, 0.02]),
+        evidence=Evidence([[45.0, 55.0], [30.0, 41.0]], [[0.0, 9.0], [0.0, 9.0]]),
+    )
+    text = own_study(model, "m.json", "own")
+    study = parse_study(text)
+    assert (study.problem.limits.u_min, study.problem.limits.u_max) == ([45.0, 30.0], [55.0, 41.1])
+    assert study.scenarios[1].noise == [0.1, 0.2]
+    assert study.scenarios[2].loads[0].size == [0.01, 0.02]
+    assert "PLACEHOLDER" not in text
+    assert "tank" not in text
+    assert "PLACEHOLDER" in own_study(MODELS["delayed"], "m.json", "own")
+
+
+def test_names_of_any_kind_and_many_signals_make_a_study():
+    names = mampc.Names(tuple(f"u\n{i}\x07" for i in range(30)), tuple(f'"y{i}' for i in range(40)))
+    model = lags(gain=np.eye(40)[:, :30] * np.pi, time_constant=9.0, dt=1.0, names=names)
+    study = parse_study(own_study(model, 'a "b"\\\n.json', "na\nme"))
+    assert study.model.file == 'a "b"\\\n.json'
+
+
+def test_models_that_make_no_study_are_refused(tmp_path):
+    for model, message in (
+        (StateSpace([[0.5]], [[0.0]], [[1.0]], None, 1.0), "none does"),
+        (StateSpace([[-0.5]], [[1.0]], [[1.0]], None, 0.0), "discrete"),
+    ):
+        model.save(tmp_path / "model.json")
+        outcome = CliRunner().invoke(
+            app, ["new", str(tmp_path / "s.toml"), "--model", str(tmp_path / "model.json")]
+        )
+        assert message in str(outcome.exception)
+        assert not (tmp_path / "s.toml").exists()
+
+
+def test_the_command_names_the_model_from_the_study_s_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models").mkdir()
+    MODELS["level"].save(tmp_path / "models" / "level.json")
+    outcome = CliRunner().invoke(app, ["new", "level.toml", "-m", "models/level.json"])
+    assert outcome.exit_code == 0, outcome.output
+    assert load_study("level.toml").model.file == "models/level.json"
+    again = CliRunner().invoke(app, ["new", "level.toml", "-m", "models/level.json"])
+    assert "does not exist yet" in str(again.exception)
+    (tmp_path / "deep").mkdir()
+    assert CliRunner().invoke(app, ["new", "deep/level.toml", "-m", "models/level.json"]).exit_code == 0
+    assert Path(load_study("deep/level.toml").model.file).is_absolute()
+
+
+def test_a_full_disk_leaves_no_file(tmp_path, monkeypatch):
+    def full(self, text, **_):
+        self.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    outcome = CliRunner().invoke(app, ["new", str(tmp_path / "study.toml")])
+    assert "No space left" in str(outcome.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def warned(tmp_path, *replacements):
+    model = lags(gain=[[2.0]], time_constant=30.0, dt=3.0)
+    model.save(tmp_path / "model.json")
+    text = own_study(model, "model.json", "own")
+    for old, new in replacements:
+        assert old in text
+        text = text.replace(old, new)
+    study = parse_study(text, folder=tmp_path)
+    return study, run_study(study.model_copy(update={"controllers": study.controllers[:2]})).warnings
+
+
+def test_a_price_that_can_never_pay_is_told_and_is_one(tmp_path):
+    study, _ = warned(tmp_path)
+    price = study.controllers[1].rules.price
+    assert warned(tmp_path)[1] == ()
+    saves = price * 16
+    _, (warning,) = warned(tmp_path, (f"price = {price}", f"price = {1.05 * saves}"))
+    assert "'price' can never move" in warning
+    for factor, moves in ((1.05, False), (0.9, True)):  # the bound is sharp where no limit is near
+        text = own_study(StateSpace.load(tmp_path / "model.json"), "model.json", "own")
+        text = text.replace(f"price = {price}", f"price = {factor * saves}")
+        run = run_study(parse_study(text, folder=tmp_path)).runs["noise-free"]["price"]
+        assert (np.ptp(run.u) > 0) == moves
+
+
+def test_a_reference_out_of_reach_and_changes_too_late_are_told(tmp_path):
+    _, (warning,) = warned(tmp_path, ("value = [0.6]", "value = [2.5]"))
+    assert "the reference of y1 is up to 0.5 away" in warning
+    _, (warning,) = warned(tmp_path, ("{ at = 5,", "{ at = 5000,"))
+    assert "after the last sample" in warning
+    assert "reference.changes at 5000" in warning
+
+
+def test_the_example_study_has_nothing_to_warn_of():
+    study = parse_study(template())
+    short = study.model_copy(update={"controllers": study.controllers[:1], "scenarios": study.scenarios[:1]})
+    assert run_study(short).warnings == ()
