@@ -13,6 +13,7 @@ from builders import identified_tank, random_model, tank_problem
 from mampc import Hypothesis, LoadBank, LoadKind
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
 from mampc.loop.load_bank import FORGETS, JUMP_GOES_ON, LEAST, STAYS, TO_JUMP
+from mampc.systems.noise import Noise
 from mampc.systems.riccati import predicted_covariance, seen_covariance
 
 LEVEL = mampc.StateSpace([[1.0, 0.3], [0.0, 0.6]], [[0.1], [0.4]], [[1.0, 0.0]], None, 1.0, [5.0], [3.0])
@@ -331,6 +332,31 @@ def test_runs_say_what_loads_do_and_replay_and_copies_decide_the_same(tmp_path):
     assert mampc.replay(regulator, state, other).quantity == "the load"
 
 
+def test_after_a_restart_far_away_the_weights_are_still_some():
+    """Whatever comes first, some hypothesis holds; also from a state in which jumps alone were possible."""
+    model = identified_tank()
+    bank = LoadBank(model, noise=1e-3)
+    start = bank.initial(model.u_op)
+    assert start.weights.sum() == pytest.approx(1.0)
+    only_jumps = replace(start, weights=np.eye(6)[5], usual=np.eye(6)[0])
+    for estimate in (start, only_jumps):
+        for size in (1e11, -1e-11):
+            after = bank.corrected(bank.predict(estimate, model.u_op), np.full(2, size))
+            assert np.isfinite(after.weights).all()
+            assert after.weights.sum() == pytest.approx(1.0)
+    assert np.isfinite(bank.corrected(start, np.full(2, 1e11)).weights).all()
+
+
+def test_an_identified_model_knows_its_noise():
+    model = replace(identified_tank(), noise=Noise(np.array([0.1, 0.2]), np.zeros(2)))
+    np.testing.assert_array_equal(LoadBank(model).noise, model.noise.output)
+    np.testing.assert_array_equal(LoadBank.for_problem(tank_problem(model)).noise, model.noise.output)
+    plain = replace(model, noise=Noise(np.zeros(2), np.zeros(2)))
+    with pytest.raises(mampc.MampcError, match="standard deviation"):
+        LoadBank(plain)
+    assert (LoadBank.for_problem(tank_problem(plain)).noise > 0.1).all()
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -347,7 +373,7 @@ def test_runs_say_what_loads_do_and_replay_and_copies_decide_the_same(tmp_path):
 )
 def test_arguments_out_of_range_are_refused(arguments, expected):
     with pytest.raises(mampc.MampcError, match=f"{expected}.*"):
-        LoadBank(**({"model": identified_tank()} | arguments))
+        LoadBank(**({"model": replace(identified_tank(), noise=None)} | arguments))
     with pytest.raises(mampc.MampcError, match="without limits"):
         LoadBank.for_problem(tank_problem(limits=mampc.Limits()))
 

@@ -34,6 +34,7 @@ FORGETS = 0.01  # share by which a sample counts in what usually holds
 LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
+IMPOSSIBLE = 1e-300  # no hypothesis is less likely, so that some are left whatever comes
 SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
@@ -78,8 +79,8 @@ class LoadBank(Estimator):
     Args:
         model: a discrete model.
         noise: standard deviation of the measurement noise of each output, scalar or (l,), in output units. Twice
-            too large, loads are found later; twice too small, noise is taken for loads. Default: `model.noise`,
-            where the model knows it; see `for_problem` for a guess.
+            too large, loads are found later; twice too small, noise is taken for loads. Default: what the record of an
+            identified model showed (`model.noise`); see `for_problem` for a guess.
         hypotheses: about the load, at least one; see `HYPOTHESES`.
 
     Raises:
@@ -95,7 +96,7 @@ class LoadBank(Estimator):
             raise MampcError("LoadBank: expected a discrete model, received dt = 0; discretise it first")
         if not hypotheses or not all(isinstance(h, Hypothesis) for h in hypotheses):
             raise MampcError("hypotheses: expected at least one Hypothesis")
-        noise = getattr(model, "noise", None) if noise is None else noise
+        noise = _identified(model) if noise is None else noise
         if noise is None:
             raise MampcError(
                 "noise: expected the standard deviation of each output's measurement noise, received none; "
@@ -136,7 +137,7 @@ class LoadBank(Estimator):
             MampcError: as for `LoadBank`; and inputs without limits where the noise has to be guessed.
         """
         model, limits = problem.model, problem.limits
-        if noise is None and getattr(model, "noise", None) is None:
+        if noise is None and _identified(model) is None:
             response = np.abs(model.step_response(21)[:, :, : model.n_inputs]).max(axis=0)
             moved = response > 0
             reach = np.where(moved, response, 0.0) @ np.where(
@@ -203,13 +204,9 @@ class LoadBank(Estimator):
             free = left[:, np.count_nonzero(size > 1e-9 * size.max(initial=0.0)) :].T  # whatever x is
             w = np.linalg.lstsq(free @ of_w, free @ wanted, rcond=1e-9)[0]
             x = np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
-        B = len(self.members)
-        usual = (
-            ~self._jumps / max(1, np.count_nonzero(~self._jumps))
-            if not self._jumps.all()
-            else np.full(B, 1 / B)
-        )
-        return self._estimate(np.tile(np.concatenate([x, w, np.zeros(k)]), (B, 1)), usual, usual)
+        usual = self._lasts / self._lasts.sum()
+        members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
+        return self._estimate(members, usual @ self._chances, usual)
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
@@ -296,7 +293,7 @@ class LoadBank(Estimator):
         """How likely each hypothesis is now, before the measurement, shape (B,); and where its filter starts."""
         weights = bank.weights
         joint = weights[:, None] * (self._chances + self._returns[:, None] * bank.usual)
-        c = self._ones.dot(joint)
+        c = np.maximum(self._ones.dot(joint), IMPOSSIBLE)
         return c, joint.T.dot(bank.members) / c[:, None]
 
     def _weighed(
@@ -325,6 +322,11 @@ class LoadBank(Estimator):
         model = self.model
         change: Array = np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op
         return change
+
+
+def _identified(model: StateSpace) -> Array | None:
+    """The noise that an identified model knows of every output, shape (l,), or None."""
+    return model.noise.output if model.noise is not None and (model.noise.output > 0).all() else None
 
 
 def _chances(jumps: BoolArray) -> tuple[Array, Array]:
