@@ -4,11 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import mampc
 from builders import tank_model
+from mampc.cli import app
 from mampc.compare import scenarios, tuning
 from mampc.compare.scenarios import settling, usual_problem
+from mampc.study import load_study, parse_study
+from mampc.study.running import run_study
+from mampc.study.writing import study_text
 
 SMALL = {
     "SEARCHED": 3, "REFINED": 4, "CONFIRMED": 6, "SEARCH_PRICES": 3, "REFINE_PRICES": 4, "DRIFTS": (0.3,),
@@ -198,3 +203,87 @@ def test_no_model_and_continuous_models_are_refused():
         tuned("model.json")
     with pytest.raises(mampc.MampcError, match="discrete"):
         tuned(mampc.StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], 0.0))
+
+
+STUDY = """
+name = "small"
+steps = 40
+dt = 10.0
+plant = { kind = "model" }
+model = { file = "model.json" }
+problem = { prediction_horizon = 12, control_horizon = 4, limits = { u_min = -10.0, u_max = 10.0 } }
+reference = { initial = [0.0], changes = [{ at = 2, value = [3.0] }] }
+scenarios = [{ name = "walk", noise = 0.05, loads = [{ kind = "random_walk", size = 0.02 }] }]
+controllers = [{ name = "MPC", method = "mpc" }]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lag().save("model.json")
+    (tmp_path / "small.toml").write_text(STUDY)
+    return tmp_path
+
+
+def command(*arguments):
+    return CliRunner().invoke(app, ["tune", "--jobs", "1", *arguments])
+
+
+@pytest.mark.parametrize(
+    "source",
+    [["small.toml"], ["model.json", "--u-min", "-10", "--u-max", "10"]],
+    ids=["study", "model"],
+)
+def test_the_command_writes_a_study_that_runs(folder, source):
+    pytest.importorskip("matplotlib")
+    result = command(*source, "--max-error-increase", "25%", "--out", "out")
+    assert result.exit_code == 0, result.output
+    assert "standard error" in result.output
+    assert "means over 6 scenarios" in result.output
+    assert (folder / "out" / "front.png").exists()
+    study = load_study(folder / "out" / "tuned.toml")
+    assert study.controllers[0].rules.price > 0
+    run = run_study(study).runs[study.scenarios[0].name]["tuned"]
+    assert 0 < run.metrics().moves.sum() < 0.5 * len(run.t)
+
+
+def test_a_study_is_compared_with_its_own_mpc(folder):
+    study = load_study("small.toml")
+    result = command("small.toml", "--max-moves-per-hour", "40", "--out", "out")
+    assert result.exit_code == 0, result.output
+    assert "at most 40 moves per hour" in result.output
+    tuned = load_study(folder / "out" / "tuned.toml")
+    assert tuned.scenarios == study.scenarios
+    assert tuned.reference == study.reference
+    assert tuned.problem.move_weight == pytest.approx([0.01])
+    assert tuned.problem.prediction_horizon == study.problem.prediction_horizon
+    assert tuned.estimator.measurement_noise == pytest.approx([0.05])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["small.toml", "--max-error-increase", "25"], "share such as 25%"),
+        (["small.toml", "--max-error-increase", "much"], "share such as 25%"),
+        (["small.toml", "--max-error-increase", "5%", "--max-moves-per-hour", "3"], "one of"),
+        (["model.json"], "--u-min and --u-max"),
+        (["model.json", "--u-min", "low", "--u-max", "1"], "--u-min: expected numbers"),
+        (["small.toml", "--u-min", "0"], "a study has limits"),
+        (["none.json", "--u-min", "0", "--u-max", "1"], "none.json"),
+        (["none.toml"], "TOML"),
+    ],
+)
+def test_the_command_says_in_a_sentence_what_does_not_fit(folder, arguments, words):
+    result = command(*arguments)
+    assert isinstance(result.exception, mampc.MampcError)
+    assert words in str(result.exception)
+
+
+@pytest.mark.parametrize("name", ["quadruple-tank", "sofc"])
+def test_a_study_that_is_written_is_read_back_the_same(name):
+    study = load_study(name)
+    odd = study.model_copy(update={"name": 'a "name" \\ with\nsigns \x7f é'})
+    for one in (study, odd):
+        again = parse_study(study_text(one, "a\nb"))
+        assert again.model_copy(update={"place": one.place}) == one

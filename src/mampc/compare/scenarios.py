@@ -60,9 +60,7 @@ class Surroundings:
     loads: tuple[tuple[Load, ...], ...]
 
     @classmethod
-    def of(
-        cls, problem: TrackingProblem, noise: Any, reference_changes: Any, loads: Sequence[Load] | None
-    ) -> Surroundings:
+    def of(cls, problem: TrackingProblem, noise: Any, reference_changes: Any, loads: Any) -> Surroundings:
         """What is told, and what the model and its limits say in place of the rest.
 
         Raises:
@@ -88,14 +86,17 @@ class Surroundings:
                 raise MampcError(f"reference_changes: expected numbers of at least 0, received {changes}")
         else:
             _range(problem, "reference_changes")
-        kinds = every_kind(model, sizes, scenario_length(problem)) if loads is None else (_given(loads),)
+        kinds = every_kind(model, sizes, scenario_length(problem)) if loads is None else _given(loads)
         return cls(sizes, changes, kinds)
 
 
-def _given(loads: Sequence[Load]) -> tuple[Load, ...]:
+def _given(loads: Any) -> tuple[tuple[Load, ...], ...]:
+    """Loads as told: a list for all scenarios, or lists that they take in turn."""
     if not isinstance(loads, Sequence):
         raise MampcError(f"loads: expected a list of mampc.loads, received {type(loads).__name__}")
-    return tuple(loads)
+    if loads and all(isinstance(kind, Sequence) for kind in loads):
+        return tuple(tuple(kind) for kind in loads)
+    return (tuple(loads),)
 
 
 def every_kind(model: StateSpace, noise: Array, samples: int) -> tuple[tuple[Load, ...], ...]:
@@ -269,6 +270,12 @@ def _reference(problem: TrackingProblem, around: Surroundings, start: Array, T: 
             level = rest + around.reference_changes * rng.uniform(-1, 1, len(rest))
         rows[at:] = np.clip(level, limits.y_min, limits.y_max)
     return rows
+
+
+def reachable(problem: TrackingProblem) -> Array:
+    """A set-point change, shape (l,), that all inputs make together by the share of their range that is assumed."""
+    change: Array = static_response(problem.model) @ (MOVED * _range(problem, "limits"))
+    return change
 
 
 def _range(problem: TrackingProblem, name: str) -> Array:

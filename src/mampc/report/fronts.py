@@ -74,8 +74,11 @@ def _shown(estimate: Estimate) -> str:
     return f"{100 * estimate.value:.1f}{error}"
 
 
-def front_figure(rows: Rows, scenario: str) -> Figure:
-    """Moves against error of every controller, both over plain MPC's; bars are standard errors over the seeds."""
+def front_figure(rows: Rows, scenario: str, marked: float | None = SHOWN) -> Figure:
+    """Moves against error of every controller, both over plain MPC's; bars are standard errors over the seeds.
+
+    A dotted line is at the ratio of errors that is `marked`.
+    """
     baseline, points = points_of(rows, scenario)
     best = sorted(points, key=lambda name: _merit(points[name], baseline))[:2]
     look = looks(list(points), ["", *best])
@@ -100,7 +103,8 @@ def front_figure(rows: Rows, scenario: str) -> Figure:
                 zorder=style.order, label=plain(name),
             )  # fmt: skip
         panel.plot([1.0], [100.0], "ks", markersize=4, zorder=6, label="plain MPC")
-        panel.axvline(SHOWN, color="#9a9a9a", linewidth=0.7, linestyle=":")
+        if marked is not None:
+            panel.axvline(marked, color="#9a9a9a", linewidth=0.7, linestyle=":")
         panel.set_yscale("log")
         panel.set_xlim(0.9, WIDEST)
         panel.set_ylim(0.6 * least, 150.0)

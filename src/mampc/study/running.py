@@ -212,13 +212,13 @@ def _acting(study: Study, prepared: Prepared, scenario: ScenarioTable) -> dict[s
         "input_disturbance": disturbance(scenario.input_disturbance, np.zeros(model.n_inputs)),
         "output_disturbance": disturbance(scenario.output_disturbance, np.zeros(model.n_outputs)),
         "measured_disturbance": disturbance(scenario.measured_disturbance, prepared.v_op),
-        "loads": [_load(study, model, table) for table in scenario.loads],
+        "loads": [load_of(study, model, table) for table in scenario.loads],
         "valves": None if scenario.valves is None else Valves(**scenario.valves.model_dump()),
         "u_initial": prepared.u_op,
     }
 
 
-def _load(study: Study, model: StateSpace, table: LoadTable) -> Load:
+def load_of(study: Study, model: StateSpace, table: LoadTable) -> Load:
     """The load that a table describes."""
     if table.file is None:
         return table.made()

@@ -1,0 +1,129 @@
+"""The command `tune`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mampc.base.errors import MampcError, shown
+from mampc.cli.app import app
+from mampc.cli.console import bar, complain, console_for_tables, progress
+
+LARGEST_INCREASE = 10.0  # of the error; more is a percentage without its sign
+
+
+@app.command()
+def tune(
+    source: Annotated[str, typer.Argument(help="A built-in study, a TOML file, or a model file (.json).")],
+    max_error_increase: Annotated[
+        str | None, typer.Option(help="Over the error of plain MPC, such as 25% or 0.25; the default is 25%.")
+    ] = None,
+    max_moves_per_hour: Annotated[
+        float | None, typer.Option(help="Of all inputs together, in place of an error.")
+    ] = None,
+    u_min: Annotated[
+        str | None, typer.Option(help="Of a model file: lower limits of the inputs, one or 0,0,...")
+    ] = None,
+    u_max: Annotated[str | None, typer.Option(help="Of a model file: upper limits of the inputs.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME-tuned.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal results.")] = 0,
+    jobs: Annotated[int, typer.Option(help="Processes; -1 for one a core.")] = -1,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant.")
+    ] = False,
+) -> None:
+    """Which controller moves least often at the error that you allow? Give one number.
+
+    Tries out estimators, move weights, tails and prices on stand-ins for the plant, off its model in gains, lags and
+    dead times, under loads of every kind. The promise is a mean over scenarios with its standard error, not one for a
+    single run. Writes a study to run (tuned.toml), the model and the front of moves against error.
+
+    Examples:
+
+        mampc tune quadruple-tank --max-error-increase 25%
+
+        mampc tune my-study.toml --max-moves-per-hour 60 --out results/calm
+
+        mampc tune model.json --u-min 0 --u-max 100,80
+    """
+    from mampc.compare.tuned_study import study_of_model, told_by, with_tuning
+    from mampc.compare.tuning import tune as search
+    from mampc.report.tuning import STUDY_FILE, told, tuning_table, write_tuning
+    from mampc.study.running import prepare
+
+    if max_error_increase is not None and max_moves_per_hour is not None:
+        raise MampcError("tune: expected one of --max-error-increase and --max-moves-per-hour, received both")
+    allowed = None if max_moves_per_hour is not None else _share(max_error_increase or "25%")
+    wanted = (
+        f"at most {max_moves_per_hour:g} moves per hour"
+        if allowed is None
+        else f"an error of at most {1 + allowed:g} times that of plain MPC"
+    )
+    goal: dict[str, Any] = {"max_error_increase": allowed, "max_moves_per_hour": max_moves_per_hour}
+    folder = Path("results") / f"{Path(source).stem}-tuned" if out is None else out
+    study = None
+    if Path(source).suffix == ".json":
+        from mampc.program.problem import Limits
+        from mampc.systems.state_space import StateSpace
+
+        if u_min is None or u_max is None:
+            raise MampcError(
+                "tune: expected --u-min and --u-max with a model file, received one or none of them"
+            )
+        model = StateSpace.load(source)
+        given: dict[str, Any] = {
+            "limits": Limits(u_min=_numbers("--u-min", u_min), u_max=_numbers("--u-max", u_max))
+        }
+    else:
+        from mampc.study import load_study
+
+        if u_min is not None or u_max is not None:
+            raise MampcError("tune: expected --u-min and --u-max with a model file only; a study has limits")
+        study = load_study(source, trust=True if trust else None)
+        with progress() as show:
+            prepared = prepare(study, show)
+        model, given = prepared.model, told_by(study, prepared)
+    with bar(source) as tell:
+        tuned = search(model, **goal, **given, seed=seed, jobs=jobs, progress=False, on_task=tell)
+    base = study_of_model(model, tuned, Path(source).stem[:80]) if study is None else study
+    note = write_tuning(
+        tuned, with_tuning(base, tuned), folder, wanted, None if allowed is None else 1 + allowed
+    )
+    console = console_for_tables()
+    if tuned.front:
+        console.print(tuning_table(tuned))
+    console.print(told(tuned, wanted), soft_wrap=True, markup=False)
+    if note is not None:
+        complain(f"note: {note}")
+    if ":" in base.plant.kind:
+        complain(
+            f"note: {STUDY_FILE} names the plant {base.plant.kind}; put it beside its module, with its model"
+        )
+    console.print(
+        f"Results are in {folder}; next: mampc run {folder / STUDY_FILE}", soft_wrap=True, markup=False
+    )
+
+
+def _share(text: str) -> float:
+    """25% or 0.25 as a number."""
+    try:
+        number = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        number = -1.0
+    if not 0 < number <= LARGEST_INCREASE:
+        raise MampcError(
+            f"--max-error-increase: expected a share such as 25% or 0.25, received {shown(text)}"
+        )
+    return number
+
+
+def _numbers(name: str, text: str) -> float | list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise MampcError(f"{name}: expected numbers such as 0 or 0,10, received {shown(text)}") from None
+    return numbers[0] if len(numbers) == 1 else numbers

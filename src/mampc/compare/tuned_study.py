@@ -1,0 +1,145 @@
+"""Studies that are tuned, and the study that tuning writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import LARGEST, Array
+from mampc.compare.scenarios import CHANGES, STAND_IN, reachable, scenario_length
+from mampc.compare.sweep import BASELINE
+from mampc.compare.tuning import Tuned
+from mampc.loop.loads import Load
+from mampc.study.running import Prepared, load_of, regulator_of
+from mampc.study.schema import (
+    LOADS,
+    ChangeTable,
+    ControllerTable,
+    EstimatorTable,
+    LimitsTable,
+    LoadTable,
+    MismatchTable,
+    ModelTable,
+    PlantTable,
+    ProblemTable,
+    ReferenceTable,
+    RulesTable,
+    ScenarioTable,
+    Study,
+)
+from mampc.systems.state_space import StateSpace
+
+MODEL_FILE = "model.json"
+
+
+def told_by(study: Study, prepared: Prepared) -> dict[str, Any]:
+    """What a study tells `tune`: plain MPC with its settings, noise, set-point changes and loads of its scenarios."""
+    model = prepared.model
+    noise = np.max([np.broadcast_to(s.noise, model.n_outputs) for s in study.scenarios], axis=0)
+    levels = np.array([study.reference.initial, *_levels(study, model.n_outputs)])
+    rest = 0.0 if study.reference.relative else model.y_op
+    loads = [[load_of(study, model, table) for table in scenario.loads] for scenario in study.scenarios]
+    return {
+        "baseline": regulator_of(study, model, BASELINE),
+        "noise": noise if (noise > 0).all() else None,
+        "reference_changes": np.abs(levels - rest).max(axis=0),
+        "loads": loads if any(loads) else None,
+    }
+
+
+def study_of_model(model: StateSpace, tuned: Tuned, name: str) -> Study:
+    """A study of a model alone, which stands in for its plant off by some shares, under each kind of load."""
+    problem = tuned.baseline.controller.problem
+    samples = scenario_length(problem)
+    size = reachable(problem)
+    rest = np.clip(model.u_op, problem.limits.u_min, problem.limits.u_max)
+    plant = PlantTable(kind="model", operating_inputs=None if (rest == model.u_op).all() else rest.tolist())
+    changes = [
+        ChangeTable(at=int((k + 0.1) * samples / CHANGES), value=(sign * size).tolist())
+        for k, sign in enumerate((1.0, -0.5, 0.5, -1.0))
+    ]
+    scenarios = [
+        ScenarioTable(
+            name=_name(kind), noise=tuned.noise.tolist(), seed=number, loads=[_table(load) for load in kind],
+            mismatch=MismatchTable(**vars(STAND_IN)),
+        )
+        for number, kind in enumerate(tuned.loads)
+    ]  # fmt: skip
+    return Study(
+        name=name, steps=samples, dt=model.dt, plant=plant, model=ModelTable(file=MODEL_FILE),
+        problem=_problem(tuned), reference=ReferenceTable(initial=[0.0] * len(size), changes=changes),
+        scenarios=scenarios, controllers=[BASELINE],
+    )  # fmt: skip
+
+
+def with_tuning(study: Study, tuned: Tuned) -> Study:
+    """A study with the problem, the estimator and the controller found, and plain MPC beside it."""
+    changed: dict[str, Any] = {"identification": None, "model": ModelTable(file=MODEL_FILE)}
+    if not np.isfinite(tuned.drift):  # plain MPC
+        return study.model_copy(update=changed | {"controllers": [BASELINE]})
+    estimator = EstimatorTable(
+        measurement_noise=tuned.noise.tolist(), drift=(tuned.drift * tuned.noise).tolist()
+    )
+    controllers = [
+        ControllerTable(name="tuned", method="exact", rules=RulesTable(price=tuned.rules.price)),
+        ControllerTable(name="MPC with these weights", method="mpc"),
+    ]
+    scenarios = [
+        scenario.model_copy(update={"loads": [_found(study, load) for load in scenario.loads]})
+        for scenario in study.scenarios
+    ]
+    changed |= {"problem": _problem(tuned), "estimator": estimator, "controllers": controllers}
+    return study.model_copy(update=changed | {"scenarios": scenarios})
+
+
+def _levels(study: Study, outputs: int) -> list[list[float]]:
+    return [np.broadcast_to(change.value, outputs).tolist() for change in study.reference.changes]
+
+
+def _name(kind: Sequence[Load]) -> str:
+    return " and ".join(_words(type(load)) for load in kind) or "no load"
+
+
+def _words(kind: type) -> str:
+    return next(name for name, known in LOADS.items() if known is kind).replace("_", " ")
+
+
+def _table(load: Load) -> LoadTable:
+    """A load of `mampc.loads` as a study says it."""
+    kind = next(name for name, known in LOADS.items() if known is type(load))
+    told = {one.name: getattr(load, one.name) for one in fields(load)}  # type: ignore[arg-type]
+    return LoadTable(kind=kind, **{k: list(v) if isinstance(v, tuple) else v for k, v in told.items()})  # type: ignore[arg-type]
+
+
+def _found(study: Study, load: LoadTable) -> LoadTable:
+    """A load whose file is found from anywhere."""
+    if load.file is None:
+        return load
+    return load.model_copy(update={"file": str((study.place.folder / Path(load.file)).resolve())})
+
+
+def _problem(tuned: Tuned) -> ProblemTable:
+    problem = tuned.problem
+    limits = {one.name: _limit(getattr(problem.limits, one.name)) for one in fields(problem.limits)}
+    return ProblemTable(
+        prediction_horizon=problem.prediction_horizon, control_horizon=problem.control_horizon,
+        output_weight=_weight(problem.output_weight), move_weight=_weight(problem.move_weight),
+        limits=LimitsTable(**limits), weigh_first_move=problem.weigh_first_move,
+        output_limit_weight=problem.output_limit_weight, tail_horizon=problem.tail_horizon,
+    )  # fmt: skip
+
+
+def _weight(matrix: Array) -> Any:
+    diagonal = np.diag(matrix)
+    return diagonal.tolist() if not (matrix - np.diag(diagonal)).any() else matrix.tolist()
+
+
+def _limit(values: Array) -> list[float] | None:
+    if np.isinf(values).all():
+        return None
+    finite: list[float] = np.clip(values, -LARGEST, LARGEST).tolist()
+    return finite
