@@ -81,13 +81,13 @@ class Regulator:
     def initial_state(
         self, u_previous: Any = None, y: Any = None, measured_disturbance: Any = None
     ) -> RegulatorState:
-        """At rest under the inputs applied so far.
+        """In a steady state under the inputs applied so far.
 
         Args:
             u_previous: shape (m,) or (h, m), latest last; default the operating point.
-            y: measurements at that rest, shape (l,); the estimator takes what the model does not
+            y: measurements in that steady state, shape (l,); the estimator takes what the model does not
                 explain for a constant disturbance, so that the first step has no jump.
-            measured_disturbance: at that rest, shape (d,); default the operating point.
+            measured_disturbance: in that steady state, shape (d,); default the operating point.
 
         Raises:
             MampcError: arrays of the wrong shape, or numbers that are not finite.
@@ -159,7 +159,7 @@ class Regulator:
                 soon as it shows (see docs/safety.md); so does what is read with a constant offset.
             measured_disturbance: now, shape (d,), in engineering units; predicted to stay as it is.
                 Left out or not usable, the last one holds on.
-            limits, manual: see `Controller.step`. Tell `u_applied` while an input is in manual; when it is
+            limits, manual: see `Controller.step`. Report `u_applied` while an input is in manual; when it is
                 back in automatic, the first plan starts from there.
 
         Raises:
@@ -240,9 +240,9 @@ def default_estimator(problem: TrackingProblem) -> Estimator:
     return KalmanFilter.offset_free(problem.model)
 
 
-def _where_usable(told: Array, otherwise: Array) -> Array:
-    """The numbers told, and the others where they are not usable."""
-    return np.where((told > -LARGEST) & (told < LARGEST), told, otherwise)
+def _where_usable(reported: Array, otherwise: Array) -> Array:
+    """The numbers reported, and the others where they are not usable."""
+    return np.where((reported > -LARGEST) & (reported < LARGEST), reported, otherwise)
 
 
 def _sizes(model: StateSpace) -> str:

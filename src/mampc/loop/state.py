@@ -26,7 +26,7 @@ class RegulatorState:
     Attributes:
         controller: inputs applied so far, and where the method starts next.
         estimate: state and disturbances, corrected with the last measurement.
-        measured_disturbance: as last told, shape (d,).
+        measured_disturbance: as last reported, shape (d,).
         sensors: what the sensor checks remember.
         actuators: what is remembered of the actuators.
     """
