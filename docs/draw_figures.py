@@ -12,6 +12,7 @@ from mampc.base.drawing import BLACK, BLUE, GREY, VERMILION, legend_above, new_f
 from mampc.base.tolerances import SAME
 from mampc.identification.export import inspect_export
 from mampc.report.figures import study_figures
+from mampc.report.identifying import identify_and_write
 from mampc.report.inspecting import inspection_figure
 from mampc.study import load_study, run_study
 
@@ -23,7 +24,8 @@ PALE = "#dce9f2"
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     save("procrastination", procrastination_figure())
-    save("export-columns", export_figure())
+    for name, figure in export_figures().items():
+        save(name, figure)
     result = run_study(load_study("quadruple-tank"), print)
     save("move-pattern", pattern_figure(result))
     for drawing in study_figures(result):
@@ -31,12 +33,22 @@ def main() -> None:
             save(drawing.name, drawing.figure)
 
 
-def export_figure():
-    """The ugly export of docs/data.md, as `mampc inspect` draws it."""
+def export_figures():
+    """The ugly export of docs/data.md as `mampc inspect` draws it, and its model as `mampc show` does."""
+    signals = {"inputs": ["PU-1.OP", "PU-2.OP"], "outputs": ["LI-1.PV", "LI-2.PV"]}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "export.csv"
         path.write_bytes(ugly_export().encode("cp1252"))
-        return inspection_figure(inspect_export(path))
+        columns = inspection_figure(inspect_export(path))
+        model = identify_and_write(
+            [path],
+            path.with_suffix(".json"),
+            print,
+            reading=signals,
+            settings={"feedthrough": False},
+            share=2 / 3,
+        ).identified.model
+    return {"export-columns": columns, "export-steps": model.plot()}
 
 
 def save(name, figure):
