@@ -367,3 +367,12 @@ def test_the_order_of_the_tank_is_four(seed, weighting):
     fitted = n4sid(tank_record(seed), weighting=weighting)
     assert fitted.order == 4
     assert (fitted.fit > 85).all()
+
+
+def test_noise_is_told_from_what_a_linear_model_lacks_of_a_nonlinear_plant():
+    """The tank's own curvature is smooth; what is left of the measurements' noise is not."""
+    plant = mampc.plants.QuadrupleTank()
+    u = mampc.prbs(order=8, amplitude=25.0, hold=5, mean=plant.u_op)
+    record = mampc.excite(plant, u, dt=10.0, noise=0.1, seed=1)
+    found = mampc.n4sid(record, order=4, feedthrough=False).model.noise.output
+    np.testing.assert_allclose(found, 0.1, rtol=0.2)

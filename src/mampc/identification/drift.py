@@ -33,6 +33,21 @@ def white_and_walk(residuals: Sequence[Array]) -> tuple[Array, Array]:
     return np.sqrt(white), np.sqrt(np.maximum(variance - 2 * white, 0.0))
 
 
+def noise_and_walk(residuals: Sequence[Array]) -> tuple[Array, Array]:
+    """The same where residuals also hold what the model lacks, which is smooth and passes for a walk.
+
+    Second differences hardly see it; of white noise v their covariance two samples apart is v. The larger white
+    part of both counts.
+    """
+    white, walk = white_and_walk(residuals)
+    bends = [np.diff(residual, 2, axis=0) for residual in residuals]
+    count = sum(max(0, len(bend) - 2) for bend in bends)
+    apart = sum((bend[2:] * bend[:-2]).sum(axis=0) for bend in bends) / max(count, 1)
+    variance = 2 * white**2 + walk**2
+    larger = np.clip(np.maximum(white**2, apart), 0.0, variance / 2)
+    return np.sqrt(larger), np.sqrt(np.maximum(variance - 2 * larger, 0.0))
+
+
 def theta(white: Array, walk: Array) -> float:
     """The filter's pole for the output that drifts most, 0 to `SLOWEST`."""
     middle = 1 + np.minimum(walk / np.maximum(white, 1e-6 * walk + 1e-300), 1e6) ** 2 / 2

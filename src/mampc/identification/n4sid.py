@@ -15,7 +15,7 @@ from mampc.identification.arx import estimate_arx
 from mampc.identification.closed_loop import certainly_unstable, estimate_predictor, under_feedback
 from mampc.identification.data import IOData
 from mampc.identification.delays import Integers, find_delays
-from mampc.identification.drift import white_and_walk
+from mampc.identification.drift import noise_and_walk
 from mampc.identification.estimate import DEGREES, Settings, estimate
 from mampc.identification.held_out import AS_GOOD, CLEARLY, RIVAL, WALK, compared, errors, split
 from mampc.identification.parts import Part, assembled, groups, part_residuals
@@ -38,6 +38,7 @@ UNSTABLE = (
 )
 ENOUGH = 20_000  # samples in which choices are compared
 SHORT = 3  # samples of dead time that are left to the states
+LEAST_NOISE = 1e-6  # of an output's spread: a record without noise shows rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +154,7 @@ def n4sid(
     if unstable == "auto" and detrend != "none" and dead is None and _keeps_unstable(records, settings):
         choice = _Choice("constant", np.zeros((l, m), dtype=int), predictor=True, notes=(UNSTABLE,))
         part, errors_ahead = estimate_predictor(records, feedthrough, order)
-        parts, noise = [part], Noise(errors_ahead * records.y_spread, np.zeros(l))
+        parts, noise = [part], Noise(np.maximum(errors_ahead, LEAST_NOISE) * records.y_spread, np.zeros(l))
     else:
         choice = _chosen(records, settings, detrend, dead, tell)
         tell("identifying a model on all of the record")
@@ -236,8 +237,8 @@ def _noise(parts: Sequence[Part], records: Scaled) -> Noise:
     output, drift = np.zeros((2, len(records.y_spread)))
     for part in parts:
         picked = list(part.outputs)
-        output[picked], drift[picked] = white_and_walk(part_residuals(part, records))
-    return Noise(output * records.y_spread, drift * records.y_spread)
+        output[picked], drift[picked] = noise_and_walk(part_residuals(part, records))
+    return Noise(np.maximum(output, LEAST_NOISE) * records.y_spread, drift * records.y_spread)
 
 
 def _parts(
