@@ -136,6 +136,14 @@ def test_the_horizon_covers_what_step_responses_take_to_settle():
     assert usual_problem(lag(time_constant=1e5), mampc.Limits(), 1.0).prediction_horizon == 60
 
 
+@pytest.mark.parametrize(("inputs", "samples"), [(1, 3), (3, 3), (4, 2), (6, 2)])
+def test_plans_have_moves_at_two_samples_at_least(inputs, samples):
+    model = lag(gain=np.eye(inputs), time_constant=np.full((inputs, inputs), 50.0))
+    problem = usual_problem(model, mampc.Limits(u_min=-1.0, u_max=1.0), 1.0)
+    found = tuning.candidates(problem, np.full(inputs, 0.01))
+    assert {one.problem.control_horizon for one in found} == {samples}
+
+
 def test_moves_per_hour_can_be_asked_for():
     found = tuned(lag(), max_moves_per_hour=40.0)
     assert found.reached

@@ -26,8 +26,10 @@ from mampc.systems.state_space import StateSpace
 
 DRIFTS = (0.1, 0.3, 1.0)  # of the loads that an estimator expects, times the noise
 MOVE_WEIGHTS = (0.03, 0.3)  # times those of plain MPC
-CONTROL_HORIZON = 3
-MOST_MOVES = 9  # planned moves of all inputs together, which keeps the patterns to a few hundred
+CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
+MOST_MOVES = (
+    9  # planned moves of all inputs together, within these, which keeps the patterns to a few hundred
+)
 
 SEARCHED, REFINED, CONFIRMED = 8, 16, 32  # scenarios of the three rounds
 SEARCH_PRICES, REFINE_PRICES = 6, 11
@@ -128,6 +130,10 @@ def moves_per_hour(point: Point, hours: float) -> Estimate:
     return Estimate(float(point.moves.mean()) / hours, _standard_error(point.moves) / hours)
 
 
+def _short(number: float) -> str:
+    return f"{number:.0f}" if abs(number) >= 100 else f"{number:.3g}"
+
+
 def _standard_error(values: Array) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
@@ -151,8 +157,8 @@ class Expected:
     def __str__(self) -> str:
         moves, error, plain = self.moves_per_hour, self.error_ratio, self.plain_moves_per_hour
         return (
-            f"{moves.value:.3g} moves per hour (standard error {moves.standard_error:.2g}; plain MPC "
-            f"{plain.value:.3g}) at {error.value:.3f} times the error of plain MPC (standard error "
+            f"{_short(moves.value)} moves per hour (standard error {_short(moves.standard_error)}; plain MPC "
+            f"{_short(plain.value)}) at {error.value:.3f} times the error of plain MPC (standard error "
             f"{error.standard_error:.2g}): means over {self.scenarios} scenarios, from which a single run may differ"
         )
 
@@ -186,7 +192,7 @@ class Tuned:
     problem: TrackingProblem
     rules: MoveRules
     expected: Expected
-    front: tuple[FrontPoint, ...]
+    front: tuple[FrontPoint, ...] = field(repr=False)
     reached: bool
     baseline: Regulator = field(repr=False)
     noise: Array = field(repr=False)
@@ -345,7 +351,7 @@ def _plain(
 def candidates(problem: TrackingProblem, noise: Array) -> list[Candidate]:
     """All that are compared, for a problem of plain MPC."""
     m, n_p = problem.model.n_inputs, problem.prediction_horizon
-    n_c = int(np.clip(MOST_MOVES // m, 1, min(CONTROL_HORIZON, n_p)))
+    n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
     found = []
     for share in MOVE_WEIGHTS:
         for tail in (0, n_p):
