@@ -29,6 +29,7 @@ GUESSED_NOISE = 0.02  # of that change, where no record told
 MOST_CHANGES = 4  # of single outputs
 PRICE = 1 / 16  # of what moves save after such a change: changes of a quarter of it are still worth them
 DEAD_BAND = 0.01  # of the inputs' range
+LARGEST_WEIGHT = 1e9
 LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
 EFFORT = 0.1  # of the error that an input's change makes, in one sample: what its move costs
 
@@ -76,8 +77,11 @@ def draft(model: StateSpace, found: Properties) -> Draft:
     asked = np.abs(changes).max(axis=0)
     # Outputs that none of the changes concerns weigh as little as what inputs do to them says.
     asked = np.where(asked > 0, asked, np.maximum((np.abs(gain) @ (high - low)) * ASKED, 1e-300))
-    output_weight = _rounded(1 / np.where(asked > 1e-300, asked, 1.0) ** 2)
-    move_weight = _rounded(_positive(EFFORT * output_weight @ gain**2))
+    output_weight: Array = 1 / np.where(asked > 1e-300, asked, 1.0) ** 2
+    move_weight = _positive(EFFORT * output_weight @ gain**2)
+    # Only ratios matter, and a study's numbers are bounded.
+    within = min(1.0, LARGEST_WEIGHT / max(output_weight.max(), move_weight.max()))
+    output_weight, move_weight = _rounded(within * output_weight), _rounded(within * move_weight)
     tail = 0.0 if found.unstable else float(horizon)  # what grows has no tail
     problem = TrackingProblem(
         model, prediction_horizon=horizon, control_horizon=min(moves, horizon), output_weight=output_weight,
@@ -228,7 +232,7 @@ file = {_string(file)}
 prediction_horizon = {problem.prediction_horizon}  # samples; the model settles within {settled}
 control_horizon = {problem.control_horizon}
 tail_horizon = {_number(problem.tail_horizon)}  # samples that a lasting error counts for beyond the prediction horizon
-output_weight = {_list(np.diag(problem.output_weight))}  # 1 / (the change of reference below)^2
+output_weight = {_list(np.diag(problem.output_weight))}  # errors count by the changes of reference below
 move_weight = {_list(np.diag(problem.move_weight))}  # by what inputs do to outputs
 # Limits of the inputs are {limit_note}.
 limits = {{ u_min = {_list(limits.u_min)}, u_max = {_list(limits.u_max)} }}  # also du_max, y_min, y_max
