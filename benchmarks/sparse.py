@@ -167,6 +167,94 @@ def exact_at_size_b() -> Row:
     )  # fmt: skip
 
 
+def exact_at_size_b_within_limits() -> Row:
+    """The slowest steps with at most 6 of 40 moves, where plans run into limits of the inputs."""
+    problem = tank_problem(limits=NARROW, **SIZE_B)
+    controller = mampc.MAMPC(problem, BUDGET_B)
+    asked = closed_loop(controller)
+    each = undisturbed(controller, asked, repeats=3)
+    proven = float(np.mean([step().status is mampc.Status.OPTIMAL for step in steps_of(controller, asked)]))
+    p99 = float(np.percentile(each, 99))
+    return Row(
+        "B, 6 of 40 moves, narrow limits: exact step, 99th percentile", "at most 20 ms", readable(p99),
+        f"median {readable(np.median(each))}, longest {readable(each.max())}; plain MPC runs into a limit in "
+        f"{active_share(problem, asked):.0%}; proven in {proven:.0%}",
+        p99 <= 0.02 and proven == 1.0,
+    )  # fmt: skip
+
+
+def move_limits_and_a_price() -> Row:
+    """Closed loop of a plant with two inputs, three outputs and a measured disturbance, far from its references."""
+    gains = [[1.9, 1.9, 1.9], [-0.74, 0.74, 0.74], [-0.5, 2.0, 0.1]]
+    constants = [[180.0, 180.0, 180.0], [80.0, 80.0, 80.0], [100.0, 250.0, 80.0]]
+    poles = np.exp(-10.0 / np.array(constants))
+    B, C = np.zeros((9, 3)), np.zeros((3, 9))
+    for i, j in np.ndindex(3, 3):
+        B[3 * i + j, j], C[i, 3 * i + j] = gains[i][j] * (1 - poles[i, j]), 1.0
+    names = mampc.Names(("u1", "u2"), ("y1", "y2", "y3"), disturbances=("v",))
+    model = mampc.StateSpace(
+        np.diag(poles.ravel()), B, C, np.zeros((3, 3)), 10.0,
+        u_op=[20, 20], y_op=[50, 30, 25], v_op=[20], names=names,
+    )  # fmt: skip
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=40, control_horizon=10, output_weight=[1, 1, 0.01], move_weight=2.0,
+        limits=mampc.Limits(u_min=10, u_max=55, du_max=0.5, y_min=20, y_max=[70, 70, 30]),
+    )  # fmt: skip
+    reference = mampc.steps(200, [50, 30, 25], [(50, [50, 40, 25]), (100, [54, 30, 25])])
+    disturbance = mampc.steps(200, [20.0], [(150, [25.0])])
+    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(price=2.0)))
+    run = mampc.simulate(
+        model, regulator, reference, measured_disturbance=disturbance, steps=200, progress=False
+    )
+    seconds = np.array([d.solve_time for d in run.decisions])
+    stopped = sum(d.status is mampc.Status.TIME_LIMIT for d in run.decisions)
+    median = float(np.median(seconds))
+    return Row(
+        "2 inputs, horizons 40/10, du_max and a price, closed loop: median exact step", "at most 5 ms",
+        readable(median),
+        f"all 200 steps {seconds.sum():.1f} s, longest {readable(seconds.max())}; {stopped} at the limit of 1 s",
+        median <= 5e-3 and not stopped,
+    )  # fmt: skip
+
+
+def on_off(horizon: int) -> Row:
+    """A valve that is open or shut, in closed loop with a first-order plant; every move of the horizon is free."""
+    plant = mampc.StateSpace([[0.95]], [[0.05]], [[20.0]], [[0.0]], 1.0)
+    problem = mampc.TrackingProblem(
+        plant, prediction_horizon=horizon, control_horizon=horizon, limits=mampc.Limits(u_min=0.0, u_max=1.0)
+    )
+    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(min_size=1.0)))
+    run = mampc.simulate(plant, regulator, reference=[8.0], steps=60, u_initial=[0.0], progress=False)
+    seconds = np.array([d.solve_time for d in run.decisions])
+    proven = float(np.mean([d.status is mampc.Status.OPTIMAL for d in run.decisions]))
+    p99 = float(np.percentile(seconds, 99))
+    return Row(
+        f"on/off valve, horizons {horizon}/{horizon}: exact step, 99th percentile", "at most 50 ms", readable(p99),
+        f"median {readable(np.median(seconds))}; proven in {proven:.0%}; mean output {run.y[30:].mean():.2f} for 8",
+        p99 <= 0.05 and proven == 1.0,
+    )  # fmt: skip
+
+
+def gap_of_many_moves() -> Row:
+    """What is left unproven after a second with 500 moves, of 10 inputs."""
+    rng = np.random.default_rng(1)
+    A = rng.standard_normal((20, 20))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    model = mampc.StateSpace(A, rng.standard_normal((20, 10)), rng.standard_normal((10, 20)), None, 1.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=100, control_horizon=50, move_weight=0.1)
+    controller = mampc.MAMPC(problem, mampc.MoveRules(max_moves=10))
+    decisions = [
+        controller.step(controller.initial_state(), rng.standard_normal(20), 2 * rng.standard_normal(10))
+        for _ in range(3)
+    ]
+    gaps = [(d.objective - d.lower_bound) / d.objective for d in decisions]
+    longest = max(d.solve_time for d in decisions)
+    return Row(
+        "10 inputs, 10 of 500 moves: gap of the exact method after 1 s", "at most 33 %", f"{max(gaps):.0%}",
+        f"gaps {', '.join(f'{gap:.0%}' for gap in gaps)}; longest step {readable(longest)}", max(gaps) <= 0.33,
+    )  # fmt: skip
+
+
 def exact_within_time() -> Row:
     """How far the exact search passes its time limit, where it is far too short."""
     limit = 0.01
@@ -232,6 +320,11 @@ ROWS: list[Callable[[], Row]] = [
     exact_tail,
     exact_with_output_limits,
     exact_at_size_b,
+    exact_at_size_b_within_limits,
+    move_limits_and_a_price,
+    partial(on_off, 10),
+    partial(on_off, 15),
+    gap_of_many_moves,
     exact_within_time,
     partial(heuristic_at_size_c, "alternating", polish=True, warm_up=0),
     partial(heuristic_at_size_c, "greedy"),

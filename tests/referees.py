@@ -180,7 +180,12 @@ def scip_bounds(problem, rules, x, u_previous, reference, seconds):
     program, n = program_of(problem, x, u_previous, reference), n_c * m
     scip = pyscipopt.Model()
     scip.hideOutput()
-    for name, value in {"limits/time": seconds, "limits/gap": 0.0, "numerics/feastol": 1e-9}.items():
+    for name, value in {
+        "limits/time": seconds,
+        "timing/clocktype": 1,
+        "limits/gap": 0.0,
+        "numerics/feastol": 1e-9,
+    }.items():
         scip.setParam(name, value)
     z = [scip.addVar(lb=None) for _ in range(l + n)]
     on = [scip.addVar(vtype="B") for _ in range(n)]

@@ -81,10 +81,17 @@ class PatternSolver:
         self._kept_bytes = 0
 
     def solve(
-        self, sample: Sample, pattern: BoolArray, cutoff: float = np.inf, deadline: float = np.inf
+        self,
+        sample: Sample,
+        pattern: BoolArray,
+        cutoff: float = np.inf,
+        deadline: float = np.inf,
+        *,
+        within: tuple[Array, Array] | None = None,
     ) -> OnPattern:
         """The best moves that are zero off `pattern`, if their objective is below `cutoff`.
 
+        With least sizes, `within` are intervals of the pattern's moves that tell their signs.
         A search over signs stops at the deadline, of `perf_counter`, or after `most_programs`.
         """
         bounds = self._bounds(sample, pattern)
@@ -95,6 +102,9 @@ class PatternSolver:
         base = sample.cost + restriction.excess(sample.target) + self.admissible.charge(pattern)
         sizes = self.admissible.min_size[pattern] if self.admissible.sized and pattern.any() else None
         lower, upper = kept = bounds[0][restriction.bounds], bounds[1][restriction.bounds]
+        if within is not None:
+            sizes, own = None, slice(restriction.n_violations, restriction.n_violations + len(within[0]))
+            lower[own], upper[own] = np.maximum(lower[own], within[0]), np.minimum(upper[own], within[1])
         if self._keeps(restriction, optimum, kept, sizes):
             return self._answer(sample, pattern, optimum, base, cutoff, None, 0)
         nearest = restriction.solve(optimum, lower, upper)

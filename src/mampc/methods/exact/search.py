@@ -23,7 +23,6 @@ from mampc.base.words import Remark, Status
 from mampc.methods.exact.ranking import Ranking, ranking_of
 from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.tree import PatternTree
-from mampc.methods.local_search import LocalSearch
 from mampc.methods.method import HELD_BY, Plan
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
@@ -67,12 +66,15 @@ class ExactSearch:
         self.admissible = AdmissiblePatterns(
             rules, problem.model.n_inputs, problem.control_horizon, condensed.input_prefix
         )
-        self._relaxation = Relaxation(condensed)
-        self._ranking = ranking_of(condensed, self.admissible)
+        # After a move of more than half its range an input can only go back; the tree knows where inputs are.
+        limits, size = problem.limits, self.admissible.min_size[: problem.model.n_inputs]
+        coarse = bool((2 * size > limits.u_max - limits.u_min).any())
+        self._ranking = None if coarse else ranking_of(condensed, self.admissible)
         self._solver = PatternSolver(condensed, self.admissible)
         if self._ranking is None:
-            self._tree = PatternTree(condensed, self.admissible)
-            self._local = LocalSearch(condensed, self.admissible)
+            self._tree = PatternTree(condensed, self.admissible, self._solver, settings.time_limit)
+        else:
+            self._relaxation = Relaxation(condensed, np.arange(condensed.n_moves), condensed.U)
 
     def plan(self, sample: Sample, inputs: Array, guess: Array | None = None) -> Plan:
         """The best moves of all admissible patterns for one sample."""
@@ -106,7 +108,7 @@ class ExactSearch:
     def _search_ranking(self, ranking: Ranking, bounds: Array, sample: Sample, past: Allowance) -> Plan:
         """Patterns of the table best bound first, ranked again whenever the limits are priced anew."""
         best, deadline, patterns = Incumbent(), self._deadline(), ranking.patterns[ranking.rows(past)]
-        oracle = SampleOracle(self, sample, best, deadline)
+        oracle = SampleOracle(self, sample, best)
 
         def rank_again(limits: LeastSquares | None) -> None:
             if limits is not None:
@@ -135,18 +137,9 @@ class ExactSearch:
             bounds[index] = np.inf
 
     def _search_tree(self, sample: Sample, past: Allowance) -> Plan:
-        """A good plan by local search, then the tree of everything that may beat it."""
-        best, deadline = Incumbent(), self._deadline()
-        oracle = SampleOracle(self, sample, best, deadline)
-        priced = [sample.least_squares]
-        if (limits := oracle.of_plain()) is not None:
-            priced.append(limits)
-        best.offer(self._solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool)))
-        self._local.offer(self._solver, sample, self.condensed.linear(priced[-1])[0], past, best, deadline)
-        if (limits := oracle.priced(best.multipliers)) is not None:
-            priced.append(limits)
-        open_bound = self._tree.search(priced, past, oracle.cutoff, deadline, oracle)
-        if open_bound < oracle.cutoff:
+        best = Incumbent()
+        open_bound = self._tree.search(sample, past, best, self._deadline())
+        if open_bound < best.objective:
             return self._plan(sample, best, open_bound, Status.TIME_LIMIT)
         return self._plan(sample, best, best.objective)
 
@@ -167,22 +160,17 @@ class ExactSearch:
 
 
 class SampleOracle:
-    """One sample as the searches see it: patterns are solved for, and limits priced, on demand."""
+    """One sample as the table sees it: limits are priced on demand."""
 
-    def __init__(self, search: ExactSearch, sample: Sample, best: Incumbent, deadline: float) -> None:
-        self._condensed, self._solver, self._relaxation = search.condensed, search._solver, search._relaxation
-        self._sample, self._best, self._deadline = sample, best, deadline
+    def __init__(self, search: ExactSearch, sample: Sample, best: Incumbent) -> None:
+        self._condensed, self._relaxation = search.condensed, search._relaxation.at(sample, sample.moves)
+        self._sample, self._best = sample, best
         self._rounding = search.condensed.rounding(sample)
 
     @property
     def cutoff(self) -> float:
         """What a plan has to cost less than to be better than the best so far."""
         return self._best.objective - tie(self._best.objective, self._rounding)
-
-    def leaf(self, pattern: BoolArray) -> tuple[float, LeastSquares | None]:
-        solved = self._solver.solve(self._sample, pattern, self._best.objective, self._deadline)
-        self._best.offer(solved)
-        return self.cutoff, self.priced(solved.multipliers)
 
     def of_plain(self) -> LeastSquares | None:
         """The limits priced in that plain MPC runs into, if any."""
@@ -192,7 +180,7 @@ class SampleOracle:
         return self.priced(self._condensed.plain.solve(sample.moves, sample.lower, sample.upper).multipliers)
 
     def relaxed(self, free: BoolArray) -> LeastSquares | None:
-        return self.priced(self._relaxation.multipliers(self._sample, free))
+        return self.priced(self._relaxation.with_moves(self._sample, free))
 
     def priced(self, multipliers: Array | None) -> LeastSquares | None:
         """The cost with limits priced in by multipliers, if any is not zero."""

@@ -1,289 +1,301 @@
 """Branch and bound over move patterns, in the order of time.
 
-A node has decided the moves up to some move i of the time-major order: those of S are made, the others
-not. All later moves are relaxed to be free, at no price and without limits. Their elimination leaves a
-quadratic in S alone: with H = U U' (U upper triangular) and y = U^-1 f, the relaxed optimum is
+A node has decided the moves up to some level of the time-major order: those of S are made, the others not. All
+later moves are relaxed to be free, which leaves a small least squares problem (see `nodes`): a sum of squares that
+rises from the free optimum as moves are left out. Early moves matter most and late ones little, so that few nodes
+survive. Moves of a least size go up or down; with the sign comes an interval, and where limits leave one value
+that is the move.
 
-    -1/2 sum_{t > i} y_t^2 - 1/2 f~_S' (H~_SS)^-1 f~_S,    H~ = U_i U_i',  f~ = U_i y_i
-
-where U_i is the leading block of U. Early moves matter most and late ones little, so that few nodes
-survive: this relaxation is what makes the search fast. Many nodes of one level are treated in one batch.
-
-Limits are priced into f by multipliers. No multipliers suit all nodes, so each is bounded with several, and takes
-the largest bound: those of leaves solved lately, and of the program that the most promising node of a batch
-relaxes to.
+Limits, and prices of later moves, come in by multipliers (see `terms`). No multipliers suit all nodes, so each is
+bounded with several, and takes the largest bound: those of the relaxed program of the root, of the most promising
+node of each batch, and of leaves. Where moves have limits and a price, the relaxed programs are so good that every
+node is given its own (see `branching`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from time import perf_counter
-from typing import NamedTuple, Protocol
-
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
+from mampc.methods.exact.branching import Branching
+from mampc.methods.exact.children import children_of
+from mampc.methods.exact.leaves import Leaves, Rest, appraised, finished, together, with_one_more
+from mampc.methods.exact.nodes import Nodes, lift, renewed, root_of, trimmed, variance_of
+from mampc.methods.exact.relaxation import Multipliers, Relaxation
+from mampc.methods.exact.sample_problem import SampleProblem
+from mampc.methods.exact.terms import Squares
+from mampc.methods.local_search import LocalSearch
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
+from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.condensing import CondensedQP
-from mampc.program.sample import LeastSquares
+from mampc.program.sample import Indices, Sample
 
 CHUNK = 256  # nodes treated at once
-KEPT_LEVELS = 300  # levels whose matrices are kept, for problems with no more moves than this
-MOST_TERMS = 8  # linear terms that nodes are bounded with
-
-Indices = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
-Priced = LeastSquares  # the cost with limits priced in
-
-
-class Nodes(NamedTuple):
-    """Nodes of one level, one a row.
-
-    Attributes:
-        chosen: positions of the moves made, padded with -1, shape (N, width).
-        used: moves made, as the budget counts them.
-        charge: their price.
-        last: sample of each input's last move, negative in the past, shape (N, m).
-        now: moves made at the sample of the next move to decide.
-        bound: relaxed optimum, prices included.
-    """
-
-    chosen: Indices
-    used: Indices
-    charge: Array
-    last: Indices
-    now: Indices
-    bound: Array
-
-    def take(self, rows: Indices | BoolArray | slice) -> Nodes:
-        return Nodes._make(array[rows] for array in self)
-
-
-class Terms:
-    """Linear terms with limits priced in, one a column; the first is that without prices.
-
-    Attributes:
-        f: shape (n, K).
-        y: U^-1 f, shape (n, K).
-        tail: relaxed optimum of the moves from i on, constants included, shape (n + 1, K).
-    """
-
-    def __init__(self, f: Array, constant: float, U_inverse: Array) -> None:
-        self.f = f[:, None]
-        self.y = U_inverse @ self.f
-        free = -0.5 * np.cumsum((self.y * self.y)[::-1], axis=0)[::-1]
-        self.tail = np.vstack([free, np.zeros((1, 1))]) + constant
-
-    def add(self, new: Terms) -> Terms:
-        """Take one more term, in place of the oldest but the first where there are too many; returns it."""
-        drop = 2 if self.f.shape[1] == MOST_TERMS else 1
-        for name in ("f", "y", "tail"):
-            kept = getattr(self, name)
-            setattr(self, name, np.hstack([kept[:, :1], kept[:, drop:], getattr(new, name)]))
-        return new
-
-
-class Oracle(Protocol):
-    """What a search asks of the sample at hand; patterns have shape (n_moves,)."""
-
-    def leaf(self, pattern: BoolArray) -> tuple[float, Priced | None]:
-        """Try a pattern: the new cutoff, and its limits priced in if any are active."""
-
-    def relaxed(self, free: BoolArray) -> Priced | None:
-        """The limits priced in that are active when these moves are free, if any are."""
+TOGETHER = 64  # leaves tried at once
+SHARE = 0.1  # of the time limit that one relaxed program may take
 
 
 class PatternTree:
-    """The search tree of one problem; `search` runs it for one sample's linear term."""
+    """The search tree of one problem; `search` runs it for one sample."""
 
-    def __init__(self, condensed: CondensedQP, admissible: AdmissiblePatterns) -> None:
-        self.admissible, self._condensed = admissible, condensed
-        self._order = np.flatnonzero(admissible.candidates)
-        self.H = condensed.H[np.ix_(self._order, self._order)]
-        n = len(self._order)
-        self._U = np.ascontiguousarray(np.linalg.cholesky(self.H[::-1, ::-1])[::-1, ::-1])
-        self._U_inverse = np.linalg.inv(self._U)
-        self._levels: list[Array | None] = [None] * n
-        self._sizes = np.append(admissible.min_size[self._order], 0.0)
-        price = admissible.price
-        self._least_price = float(price.min())
+    def __init__(
+        self,
+        condensed: CondensedQP,
+        admissible: AdmissiblePatterns,
+        solver: PatternSolver,
+        time_limit: float | None,
+    ) -> None:
+        self._admissible, self._solver = admissible, solver
+        order = np.flatnonzero(admissible.candidates)
+        self._squares = Squares(condensed, order)
+        self._relaxation = Relaxation(
+            condensed, order, self._squares.L[:, :-1], None if time_limit is None else SHARE * time_limit
+        )
+        self._local = LocalSearch(condensed, admissible)
+        # A price per unit says little of moves that can be large.
+        limits = condensed.problem.limits
+        self._close = admissible.priced and not admissible.sized and bool(np.isfinite(limits.du_max).any())
 
-    def search(
-        self, priced: Sequence[Priced], past: Allowance, cutoff: float, deadline: float, oracle: Oracle
-    ) -> float:
-        """Visit every admissible pattern that may cost less than the cutoff.
+    def search(self, sample: Sample, allowance: Allowance, best: Incumbent, deadline: float) -> float:
+        """Visit every admissible pattern that may cost less than the best plan, to which better ones are offered.
 
         Args:
-            priced: the cost, and those with limits priced in, if any.
-            past: what the applied moves leave.
-            cutoff: patterns at or above it (prices included) are of no interest.
             deadline: of `perf_counter`.
-            oracle: `leaf` is called with patterns, best bound first.
 
         Returns:
             A lower bound over everything that was not visited: infinite when the search is complete.
         """
-        of, n = self.admissible, len(self._order)
-        terms, *others = map(self._terms, priced)
-        for other in others:
-            terms.add(other)
-        rest = np.array(past.frozen, dtype=np.intp)
-        root = Nodes(
-            np.full((1, 0), -1), np.zeros(1, np.intp), np.zeros(1), (rest - of.rules.dwell)[None],
-            np.zeros(1, np.intp), np.array([terms.tail[0].max() + self._least_price]),
-        )  # fmt: skip
-        pending = [(0, root)] if past.left > 0 and n else []
+        problem = SampleProblem(
+            self._squares, self._relaxation, self._admissible, self._solver, sample, allowance, best, deadline
+        )
+        problem.offer(problem.pattern(np.zeros(0, dtype=np.intp)))
+        if not (allowance.left > 0 and len(problem.order)):
+            return np.inf
+        limited = bool(sample.margins.min(initial=np.inf) < 0)
+        if limited or self._admissible.priced:
+            self._relax_root(problem)
+        if limited and self._close:
+            return Branching(problem).run()
+        terms, f = problem.terms, np.zeros(self._admissible.n_moves)
+        f[problem.order] = -2.0 * (terms.c[:, -1] @ self._squares.L[:, :-1])
+        self._local.offer(self._solver, sample, f, allowance, best, deadline)
+        found = problem.relaxation.of_bounds(best.multipliers)
+        if found is not None and found.active:
+            terms.add(found)
+        return _BatchSearch(problem).run()
+
+    def _relax_root(self, problem: SampleProblem) -> None:
+        """Bound everything with limits and prices as a relaxed program has them, and try its moves."""
+        domain = problem.domain
+        found = problem.relaxation.solve_priced(domain.low, domain.high, domain.up, domain.down)
+        if not found.solved or not found.active:
+            return
+        problem.terms.add(found)
+        pattern = problem.moving(found.moves)
+        if self._admissible.allows(pattern, problem.allowance):
+            problem.offer(pattern)
+
+
+class _BatchSearch:
+    """The search of one sample, many nodes of one level at a time."""
+
+    def __init__(self, problem: SampleProblem) -> None:
+        self._problem, self._of, self._terms = problem, problem.admissible, problem.terms
+        self._squares, self._order = problem.squares, problem.order
+        self._left_at_root = problem.allowance.left
+        # Nodes with one move left need no descendants: all last moves are priced at once.
+        self._resolves = not (
+            self._of.sized or self._of.simultaneous or self._squares.refined or self._left_at_root == 1
+        )
+        # Another move never costs more: then only patterns that spend the whole budget are of interest.
+        self._nested = self._of.simple and not (
+            self._of.priced or self._of.sized or any(problem.allowance.frozen)
+        )
+
+    def run(self) -> float:
+        """A lower bound over everything that was not visited: infinite when the search is complete."""
+        problem, n = self._problem, len(self._order)
+        root = self._bounded(0, root_of(self._terms, problem.allowance, self._of))
+        pending = [(0, root, list(self._terms.ids))]
         while pending:
-            if perf_counter() > deadline:
+            if problem.late:
                 return _least_bound(pending)
-            level, nodes = pending.pop()
-            nodes = nodes.take(nodes.bound < cutoff)
+            level, nodes, ids = pending.pop()
+            nodes = nodes.below(problem.cutoff)
             if not len(nodes.bound):
                 continue
             if len(nodes.bound) > CHUNK:
                 by_bound = np.argsort(nodes.bound, kind="stable")
-                pending.append((level, nodes.take(by_bound[CHUNK:])))
+                pending.append((level, nodes.take(by_bound[CHUNK:]), ids))
                 nodes = nodes.take(by_bound[:CHUNK])
-            children, including = self._children(level, nodes, past)
-            if including:
-                made = children.take(slice(len(children.used) - including, None))
-                cutoff = self._try(made, terms, cutoff, deadline, oracle)
-                if (
-                    perf_counter() > deadline
-                ):  # these nodes bound their descendants, those just tried among them
-                    return _least_bound([*pending, (level, nodes)])
+            nodes = self._renewed(level, nodes, ids)
+            ids = list(self._terms.ids)
+            children, made = children_of(level, nodes, problem)
+            if made is not None:
+                self._try(level + 1, made)
+                if problem.late:
+                    # These nodes bound their descendants, those just tried among them.
+                    return _least_bound([*pending, (level, nodes, ids)])
             if level + 1 == n:
                 continue
-            children = self._growable(level, children, past)
-            if len(children.used):
-                bound = self._bound(level, children, terms, cutoff, oracle)
-                pending.append((level + 1, children._replace(bound=bound).take(bound < cutoff)))
+            children = self._growable(level, children)
+            if len(children.bound):
+                children = self._bounded(level + 1, self._renewed(level + 1, trimmed(children), ids))
+                children = self._sharpened(level + 1, children.below(problem.cutoff)).below(problem.cutoff)
+            if len(children.bound):
+                pending.append((level + 1, children, list(self._terms.ids)))
         return np.inf
 
-    def _try(self, made: Nodes, terms: Terms, cutoff: float, deadline: float, oracle: Oracle) -> float:
-        """Try the patterns of these nodes with no further move, best bound first; returns the new cutoff."""
+    def _renewed(self, level: int, nodes: Nodes, ids: list[int]) -> Nodes:
+        """The nodes, whose columns belong to the terms `ids`, with those of the terms there are now."""
+        now = self._terms.ids
+        if ids == now:
+            return nodes
+        columns = [k for k in range(len(now)) if k >= len(ids) or ids[k] != now[k]]
+        return renewed(level, nodes, columns, self._squares, self._terms)
 
-        def values_for(terms: Terms) -> Array:
-            values: Array = (self._minimum(self.H, terms.f, made.chosen) + terms.tail[-1]).max(axis=1)
-            return values + made.charge
+    def _bounded(self, level: int, nodes: Nodes) -> Nodes:
+        """The nodes, which have decided `level` moves and will make another one, with their bounds."""
+        paid = nodes.now > 0 if self._of.simultaneous else None
+        value = nodes.value + self._terms.later(level, self._left_at_root - nodes.used, paid)
+        if self._of.sized:
+            value += lift(nodes.low, nodes.high, nodes.d, variance_of(nodes.root))
+        return nodes._replace(bound=np.maximum(nodes.bound, value.max(axis=1) + nodes.charge))
 
-        values = values_for(terms)
-        while values[row := int(values.argmin())] < cutoff and perf_counter() <= deadline:
-            cutoff, limits = oracle.leaf(self._pattern(made.chosen[row]))
-            values[row] = np.inf
-            if limits is None:
-                continue
-            np.maximum(values, values_for(terms.add(self._terms(limits))), out=values)
-            # Where a pattern does not move, its multipliers say little of those that do: price all that are left.
-            if (left := values < cutoff).any():
-                limits = oracle.relaxed(self._pattern(made.chosen[left]))
-                if limits is not None:
-                    np.maximum(values, values_for(terms.add(self._terms(limits))), out=values)
-        return cutoff
+    def _sharpened(self, level: int, nodes: Nodes) -> Nodes:
+        """The nodes bounded with the multipliers of the most promising one, where limits matter."""
+        if len(self._terms.ids) == 1 or not len(nodes.bound):
+            return nodes
+        domain, row = self._problem.domain, int(nodes.bound.argmin())
+        undecided = np.arange(len(self._order)) >= level
+        low, high = self._intervals(nodes.chosen[row], nodes.low[row], nodes.high[row])
+        found = self._problem.relaxation.solve_priced(
+            np.where(undecided, domain.low, low), np.where(undecided, domain.high, high),
+            np.where(undecided, domain.up, 0.0), np.where(undecided, domain.down, 0.0),
+        )  # fmt: skip
+        if not found.solved or not found.active:
+            return nodes
+        ids = list(self._terms.ids)
+        self._terms.add(found)
+        return self._bounded(level, self._renewed(level, nodes, ids))
 
-    def _bound(self, level: int, children: Nodes, terms: Terms, cutoff: float, oracle: Oracle) -> Array:
-        """The bounds of nodes that have decided the moves up to `level`."""
-        further = np.full(len(children.used), self._least_price)
-        if self.admissible.simultaneous:
-            further[children.now > 0] = 0.0
-        further += children.charge
-        bound = np.maximum(children.bound, self._relaxed(level, children.chosen, terms) + further)
-        row = int(bound.argmin())
-        if terms.f.shape[1] > 1 and bound[row] < cutoff:  # limits matter at this sample
-            free = self._pattern(children.chosen[row])
-            free[self._order[level + 1 :]] = True
-            limits = oracle.relaxed(free)
-            if limits is not None:
-                latest = terms.add(self._terms(limits))
-                bound = np.maximum(bound, self._relaxed(level, children.chosen, latest) + further)
-        return np.asarray(bound)
+    def _intervals(self, chosen: Indices, low: Array, high: Array) -> tuple[Array, Array]:
+        """The intervals of all moves, shape (n,), where those `chosen` are made and the others are not."""
+        made, domain = chosen[chosen >= 0], self._problem.domain
+        least, most = np.zeros(len(self._order)), np.zeros(len(self._order))
+        if self._of.sized:
+            least[made], most[made] = low[: len(made)], high[: len(made)]
+        else:
+            least[made], most[made] = domain.low[made], domain.high[made]
+        return least, most
 
-    def _terms(self, priced: Priced) -> Terms:
-        f, constant = self._condensed.linear(priced)
-        return Terms(f[self._order], constant, self._U_inverse)
-
-    def _pattern(self, chosen: Indices) -> BoolArray:
-        """The moves made at nodes `chosen`, shape (n_moves,)."""
-        pattern = np.zeros(self.admissible.n_moves, dtype=bool)
-        pattern[self._order[chosen[chosen >= 0]]] = True
-        return pattern
-
-    def _children(self, level: int, nodes: Nodes, past: Allowance) -> tuple[Nodes, int]:
-        """The nodes without and, after them, with the level's move, and how many the latter are."""
-        of = self.admissible
-        j, a = divmod(int(self._order[level]), of.n_inputs)
-        counts = (nodes.now == 0) | (not of.simultaneous)
-        may = (
-            (nodes.used + counts <= past.left)
-            & (nodes.now < of.per_step)
-            & (j >= nodes.last[:, a] + of.rules.dwell)
-        )
-        made = nodes.take(may)
-        chosen = np.hstack([made.chosen, np.full((len(made.used), 1), level)])
-        if np.ndim(made.chosen) and made.chosen.shape[1]:
-            # Keep the rows packed: the new move goes behind the last one.
-            width = (made.chosen >= 0).sum(axis=1)
-            chosen[:, -1] = -1
-            chosen[np.arange(len(width)), width] = level
-        made_counts = counts[may]
-        last = made.last.copy()
-        last[:, a] = j
-        made = Nodes(
-            chosen,
-            made.used + made_counts,
-            made.charge + of.price[a] * made_counts,
-            last,
-            made.now + 1,
-            made.bound,
-        )
-        left_out = nodes._replace(chosen=np.hstack([nodes.chosen, np.full((len(nodes.used), 1), -1)]))
-        together = Nodes(*(np.concatenate(pair) for pair in zip(left_out, made, strict=True)))
-        width = int((together.chosen >= 0).sum(axis=1).max(initial=0))
-        together = together._replace(chosen=together.chosen[:, :width])
-        return together, len(made.used)
-
-    def _growable(self, level: int, nodes: Nodes, past: Allowance) -> Nodes:
+    def _growable(self, level: int, nodes: Nodes) -> Nodes:
         """The nodes that may still get a move after this level, with `now` for the next move."""
-        of = self.admissible
+        of = self._of
         if self._order[level + 1] // of.n_inputs != self._order[level] // of.n_inputs:
             nodes = nodes._replace(now=np.zeros_like(nodes.now))
-        spent = nodes.used >= past.left
+        spent = nodes.used + self._resolves >= self._left_at_root
         if of.simultaneous:
             spent &= nodes.now == 0
-        return nodes.take(~spent)
+        return nodes.take(~spent) if spent.any() else nodes
 
-    def _relaxed(self, level: int, chosen: Indices, terms: Terms) -> Array:
-        """The relaxed optimum with the moves made, all later moves being free."""
-        U = self._U[: level + 1, : level + 1]
-        H = self._levels[level]
-        if H is None:
-            H = U @ U.T
-            if len(self._levels) <= KEPT_LEVELS:
-                self._levels[level] = H
-        values = self._minimum(H, U @ terms.y[: level + 1], chosen) + terms.tail[level + 1]
-        return np.asarray(values.max(axis=1))
+    def _try(self, level: int, made: Nodes) -> None:
+        """Try the patterns of these nodes with no further move, or with the last one where one is left."""
+        left = self._left_at_root - made.used
+        if self._nested:
+            wanted = left == 1 if self._resolves else left == 0
+            if not wanted.any():
+                return
+            if not wanted.all():
+                made, left = made.take(wanted), left[wanted]
+        last = (left == 1) & self._resolves
+        made = trimmed(made)
+        leaves, rest = finished(level, made, self._squares, self._terms)
+        if level < len(self._order) and last.any():
+            if last.all():
+                more = self._with_last_moves(level, made, leaves, rest)
+            else:
+                some = Rest._make([array[last] for array in rest])
+                more = self._with_last_moves(level, made.take(last), leaves.take(last), some)
+            leaves = more if self._nested else together(leaves, more)
+        if len(leaves.bound) > TOGETHER:
+            leaves = leaves.take(np.argsort(leaves.bound, kind="stable"))
+        for first in range(0, len(leaves.bound), TOGETHER):
+            if not self._try_leaves(leaves.take(slice(first, first + TOGETHER))):
+                return
 
-    def _minimum(self, H: Array, f: Array, chosen: Indices) -> Array:
-        """min over the chosen moves of 1/2 d' H d + f' d, at least as large as their least sizes demand.
+    def _with_last_moves(self, level: int, nodes: Nodes, leaves: Leaves, rest: Rest) -> Leaves:
+        """The patterns of these nodes with one more move, as far as they may beat the best plan."""
+        of, order = self._of, self._order[level:]
+        j, a = order // of.n_inputs, order % of.n_inputs
+        bound = with_one_more(level, nodes, rest, self._squares, self._terms)
+        bound = np.maximum(bound + leaves.charge[:, None] + of.price[a], nodes.bound[:, None])
+        may = (bound < self._problem.cutoff) & (j >= nodes.last[:, a] + of.rules.dwell)
+        if of.per_step < of.n_inputs:
+            current = j == int(self._order[level - 1]) // of.n_inputs
+            may &= ~current | (nodes.now[:, None] < of.per_step)
+        rows, columns = np.nonzero(may)
+        chosen = np.full((len(rows), int(nodes.width.max(initial=0)) + 1), -1)
+        chosen[:, : leaves.chosen.shape[1]] = leaves.chosen[rows]
+        chosen[np.arange(len(rows)), nodes.width[rows]] = level + columns
+        charge = leaves.charge[rows] + of.price[a[columns]]
+        return Leaves(chosen, charge, leaves.low[rows], leaves.high[rows], bound[rows, columns])
 
-        For linear terms f, shape (n, K); the result has shape (N, K).
-        """
-        size, width = chosen.shape
-        if not width:
-            return np.zeros((size, f.shape[1]))
-        none = chosen < 0
-        linear = np.where(none[:, :, None], 0.0, f[chosen])
-        matrices = H[chosen[:, :, None], chosen[:, None, :]]
-        matrices[none[:, :, None] | none[:, None, :]] = 0.0
-        matrices[:, np.arange(width), np.arange(width)] += none
-        if not self.admissible.sized:
-            values: Array = -0.5 * (linear * np.linalg.solve(matrices, linear)).sum(axis=1)
-            return values
-        inverses = np.linalg.inv(matrices)
-        optima = -(inverses @ linear)
-        short = np.maximum(self._sizes[chosen][:, :, None] - np.abs(optima), 0.0)  # -1 has size zero
-        lift = 0.5 * (short * short / np.einsum("nii->ni", inverses)[:, :, None]).max(axis=1)
-        return np.asarray(0.5 * (linear * optima).sum(axis=1) + lift)
+    def _try_leaves(self, leaves: Leaves) -> bool:
+        """Try these patterns, best bound first; says whether others of larger bounds may be worth it."""
+        problem, terms = self._problem, self._terms
+        left = leaves.bound < problem.cutoff
+        if not left.any():
+            return False
+        if len(terms.ids) > 1:
+            leaves = appraised(leaves.take(left), self._squares, terms, list(range(len(terms.ids))))
+        while leaves.bound[row := int(leaves.bound.argmin())] < problem.cutoff:
+            if problem.late:
+                return False
+            left = leaves.bound < problem.cutoff
+            if not left.all():
+                leaves = leaves.take(left)
+                row = int(leaves.bound.argmin())
+            if limited := len(terms.ids) > 1:
+                relaxed = problem.relaxation.solve(
+                    *self._intervals(leaves.chosen[row], leaves.low[row], leaves.high[row])
+                )
+                if relaxed.infeasible:
+                    leaves.bound[row] = np.inf
+                    continue
+                leaves = self._priced(leaves, relaxed)
+            if not limited or leaves.bound[row] < problem.cutoff:
+                before, within = problem.best.objective, None
+                positions = leaves.chosen[row][leaves.chosen[row] >= 0]
+                if self._of.sized:
+                    within = leaves.low[row, : len(positions)], leaves.high[row, : len(positions)]
+                found = problem.offer(problem.pattern(positions), within)
+                leaves.bound[row] = np.inf
+                leaves = self._priced(leaves, found)
+                if problem.best.objective < before:
+                    continue
+            left = leaves.bound < problem.cutoff
+            if left.sum() > 1 and len(terms.ids) > 1:
+                leaves = self._priced(leaves, self._of_all(leaves, left))
+        return True
+
+    def _of_all(self, leaves: Leaves, rows: BoolArray) -> Multipliers:
+        """Multipliers with the moves of all these patterns: those of one say little of moves that it does not make."""
+        made = np.zeros(len(self._order), dtype=bool)
+        chosen = leaves.chosen[rows]
+        made[chosen[chosen >= 0]] = True
+        domain = self._problem.domain
+        return self._problem.relaxation.solve(
+            np.where(made, domain.low, 0.0), np.where(made, domain.high, 0.0)
+        )
+
+    def _priced(self, leaves: Leaves, found: Multipliers | None) -> Leaves:
+        """The leaves bounded with one more term."""
+        if found is None or not found.solved or not found.active:
+            return leaves
+        self._terms.add(found)
+        return appraised(leaves, self._squares, self._terms, [self._terms.latest])
 
 
-def _least_bound(pending: list[tuple[int, Nodes]]) -> float:
-    return float(min(nodes.bound.min(initial=np.inf) for _, nodes in pending))
+def _least_bound(pending: list[tuple[int, Nodes, list[int]]]) -> float:
+    return float(min(nodes.bound.min(initial=np.inf) for _, nodes, _ in pending))

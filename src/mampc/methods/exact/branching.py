@@ -1,0 +1,214 @@
+"""Branch and bound where limits bind: every node is a quadratic program.
+
+At a node some moves are made, some left out, and the others undecided: free within what they can be, at the price
+per unit that is at most theirs (see `relaxation`). With the multipliers of its program the cost is a quadratic about
+the program's moves d, whose curvature is that of the free moves alone: with P = Z Z' the inverse of their normal
+matrix leaving out the move i adds at least
+
+    d_i^2 / P_ii
+
+and making it what its price exceeds that in the program. Moves for which one of both is too much are decided at once;
+the search branches on the move whose leaving out adds most. Best bound first, so that a search cut short leaves
+the best bound there is.
+"""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray
+from mampc.methods.exact.sample_problem import SampleProblem
+from mampc.program.sample import Indices
+
+UNDECIDED, OUT, MADE = 0, 1, 2
+
+
+class Solved(NamedTuple):
+    """A node's relaxed program.
+
+    Attributes:
+        bound: on all that the node leads to.
+        d: its moves, shape (n,).
+        out, made: what leaving out or making each undecided move adds to the bound at least, shape (n,).
+        undecided: which are, shape (n,).
+    """
+
+    bound: float
+    d: Array
+    out: Array
+    made: Array
+    undecided: BoolArray
+
+
+class Branching:
+    """The search of one sample."""
+
+    def __init__(self, problem: SampleProblem) -> None:
+        self._problem, self._of = problem, problem.admissible
+        order, m, dwell = problem.order, self._of.n_inputs, self._of.rules.dwell
+        self._at = order // m
+        self._samples = self._of.control_horizon
+        self._price = self._of.price[order % m]
+        self._near: BoolArray | None = None  # pairs of moves that the dwell time keeps apart
+        if dwell > 1:
+            apart = np.abs(self._at[:, None] - self._at)
+            self._near = (apart < dwell) & (order[:, None] % m == order % m) & (apart > 0)
+        self._tried: set[bytes] = set()
+        self._failed = False  # whether a program had no answer
+
+    def run(self) -> float:
+        """A lower bound over everything that was not visited: infinite when the search is complete."""
+        problem = self._problem
+        state: Indices = np.full(len(self._at), UNDECIDED)
+        state[(problem.domain.low == 0) & (problem.domain.high == 0)] = OUT
+        heap: list[tuple[float, int, Indices, Array]] = []
+        if self._closed(state):
+            heap.append((float(problem.terms.rest[0]), 0, state, problem.squares.inverse))
+        number = 0  # tells nodes of equal bounds apart
+        while heap:
+            bound, _, state, Z = heap[0]
+            if bound >= problem.cutoff:
+                return np.inf
+            if problem.late:
+                return bound
+            heappop(heap)
+            Z = self._without(Z, np.flatnonzero((state == OUT) & Z.any(axis=1)))
+            for child_bound, child in self._children(state, Z):
+                number += 1
+                heappush(heap, (child_bound, number, child, Z))
+            if self._failed:  # what this node leads to stays unproven
+                return bound
+        return np.inf
+
+    def _children(self, state: Indices, Z: Array) -> list[tuple[float, Indices]]:
+        """What a node leads to, as far as it may beat the best plan, with bounds."""
+        solved = self._solve(state, Z)
+        if solved is None or solved.bound >= self._problem.cutoff:
+            return []
+        gap = self._problem.cutoff - solved.bound
+        made, out = solved.undecided & (solved.out >= gap), solved.undecided & (solved.made >= gap)
+        if (made & out).any():
+            return []
+        if decided := bool(made.any() or out.any()):
+            state = state.copy()
+            state[made], state[out] = MADE, OUT
+            if not self._closed(state):
+                return []
+        i = int(np.where(state == UNDECIDED, solved.out, -1.0).argmax())
+        if state[i] != UNDECIDED:
+            return [(solved.bound, state)] if decided else []
+        children = []
+        for kind, adds in ((OUT, solved.out[i]), (MADE, solved.made[i])):
+            child = state.copy()
+            child[i] = kind
+            if solved.bound + adds < self._problem.cutoff and self._closed(child):
+                children.append((float(solved.bound + adds), child))
+        return children
+
+    def _without(self, Z: Array, left_out: Indices) -> Array:
+        """Z with these moves left out."""
+        if not len(left_out):
+            return Z
+        Z = Z.copy()
+        for i in left_out:
+            phi = Z[i].copy()
+            Z -= np.outer(Z @ phi, phi / (phi @ phi))
+            Z[i] = 0.0
+        return Z
+
+    def _closed(self, state: Indices) -> bool:
+        """Leave out what the rules forbid beside the moves made, in place; False where those break a rule."""
+        of, made = self._of, state == MADE
+        open_ = state == UNDECIDED
+        used = int(made.sum())
+        if not of.simple:
+            at = np.bincount(self._at[made], minlength=self._samples)
+            if (at > of.per_step).any():
+                return False
+            if self._near is not None:
+                near = self._near[made].any(axis=0)
+                if near[made].any():
+                    return False
+                state[open_ & near] = OUT
+            state[open_ & (at[self._at] >= of.per_step)] = OUT
+            if of.simultaneous:
+                used = int((at > 0).sum())
+                if used >= self._problem.allowance.left:
+                    state[open_ & (at[self._at] == 0)] = OUT
+                return used <= self._problem.allowance.left
+        if used >= self._problem.allowance.left:
+            state[open_] = OUT
+        return used <= self._problem.allowance.left
+
+    def _solve(self, state: Indices, Z: Array) -> Solved | None:
+        """The node's program; None without an answer. A plan that it shows is tried."""
+        domain, of = self._problem.domain, self._of
+        undecided, made = state == UNDECIDED, state == MADE
+        within = state != OUT
+        low, high = np.where(within, domain.low, 0.0), np.where(within, domain.high, 0.0)
+        paid = np.zeros(self._samples, dtype=bool)
+        slope = undecided
+        if of.simultaneous:
+            paid[self._at[made]] = True
+            slope = undecided & ~paid[self._at]
+        up, down = np.where(slope, domain.up, 0.0), np.where(slope, domain.down, 0.0)
+        found = self._problem.relaxation.solve_priced(low, high, up, down)
+        if not found.solved:
+            self._failed = not found.infeasible
+            return None
+        d = found.moves
+        s = np.where(domain.bounded | ~within, found.pulls, 0.0)
+        _, rest = self._problem.terms.priced(found, s)
+        support = np.maximum(np.maximum(s * low, s * high), 0.0)
+        variance = np.einsum("iq,iq->i", Z, Z)
+        out = d * d / np.where(variance > 0, variance, np.inf)
+        if of.simultaneous:
+            bound, adds = self._of_samples(rest, support, undecided, paid)
+        else:
+            adds = self._price - support
+            gains = np.minimum(adds, 0.0)
+            left = self._problem.allowance.left - int(made.sum())
+            open_ = gains[undecided]
+            if left < len(open_):
+                open_ = np.sort(open_)[:left]
+            bound = rest + float(adds[made].sum() + open_.sum())
+            out, adds = out - gains, adds - gains
+            moving = out[undecided & (d != 0)]
+            if left < len(moving):  # so many of them have to be left out
+                bound += float(np.sort(moving)[len(moving) - left - 1])
+        priced = of.charge(self._problem.pattern(made))
+        self._try(d, within, bound - priced - float(np.maximum(d * up, -d * down).sum()))
+        return Solved(bound, d, out, adds, undecided)
+
+    def _of_samples(
+        self, rest: float, support: Array, undecided: BoolArray, paid: BoolArray
+    ) -> tuple[float, Array]:
+        """Bound and what making moves adds, where samples have a price."""
+        pull = np.bincount(self._at, weights=support, minlength=self._samples)
+        open_ = np.bincount(self._at[undecided], minlength=self._samples) > 0
+        price = self._of.price[0]
+        adds = np.where(open_ & ~paid, price - pull, 0.0)
+        gains = np.minimum(adds, 0.0)
+        left = self._problem.allowance.left - int(paid.sum())
+        kept = np.sort(gains)[:left] if left < len(gains) else gains
+        bound = rest + float((price - pull)[paid].sum() - pull[~paid & ~open_].sum() + kept.sum())
+        return bound, (adds - gains)[self._at]
+
+    def _try(self, d: Array, within: BoolArray, without_prices: float) -> None:
+        """Offer the best plan with the moves of the program that are not zero, if it may be the best one.
+
+        Args:
+            without_prices: about the program's cost without the prices of moves that are undecided.
+        """
+        of = self._of
+        pattern = self._problem.moving(np.where(within, d, 0.0))
+        key = pattern.tobytes()
+        if key in self._tried:
+            return
+        self._tried.add(key)
+        cost = without_prices + of.charge(pattern)
+        if cost < self._problem.best.objective and of.allows(pattern, self._problem.allowance):
+            self._problem.offer(pattern)

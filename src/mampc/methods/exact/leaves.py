@@ -1,0 +1,126 @@
+"""Leaves of the search tree: patterns without any further move, many at a time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray
+from mampc.methods.exact.nodes import Nodes, lift
+from mampc.methods.exact.terms import Squares, Terms
+from mampc.program.sample import Indices
+
+
+class Leaves(NamedTuple):
+    """Patterns, one a row.
+
+    Attributes:
+        chosen: positions of their moves, padded with -1, shape (N, w).
+        charge: prices.
+        low, high: least and largest values of the moves, shape (N, w), or (N, 0) without least sizes.
+        bound: on what each costs, price included.
+    """
+
+    chosen: Indices
+    charge: Array
+    low: Array
+    high: Array
+    bound: Array
+
+    def take(self, rows: Indices | BoolArray | slice) -> Leaves:
+        return Leaves._make([array[rows] for array in self])
+
+
+class Rest(NamedTuple):
+    """What nodes leave when no move follows, each in its best term.
+
+    Attributes:
+        term: the term, shape (N,).
+        value: the cost without prices.
+        residual: of the rows after the node's, shape (N, n - level).
+        inverse: of the normal matrix in the coordinates of the nodes' root, shape (N, q, q).
+    """
+
+    term: Indices
+    value: Array
+    residual: Array
+    inverse: Array
+
+
+def finished(level: int, nodes: Nodes, squares: Squares, terms: Terms) -> tuple[Leaves, Rest]:
+    """The nodes, which have decided `level` moves, with all later ones left out."""
+    every = np.arange(len(nodes.bound))
+    term = nodes.value.argmax(axis=1)
+    d, value, root = nodes.d[every, :, term], nodes.value[every, term], nodes.root
+    A = squares.L[level:][:, nodes.chosen].transpose(1, 0, 2)
+    residual = terms.c[level:, term].T[:, :, None] - A @ d[:, :, None]
+    M = A @ root
+    across = M.transpose(0, 2, 1)
+    normal = across @ M
+    diagonal = np.arange(root.shape[2])
+    normal[:, diagonal, diagonal] += 1.0
+    inverse = np.linalg.inv(normal)
+    x = inverse @ (across @ residual)
+    residual -= M @ x
+    if squares.refined:
+        step = inverse @ (across @ residual - x)
+        x, residual = x + step, residual - M @ step
+    value = value + np.square(x[:, :, 0]).sum(axis=1) + np.square(residual[:, :, 0]).sum(axis=1)
+    if nodes.low.shape[1]:
+        variance = ((root @ inverse) * root).sum(axis=2)
+        value += lift(nodes.low, nodes.high, d[:, :, None] + root @ x, variance)[:, 0]
+    bound = np.maximum(nodes.bound, value + nodes.charge)
+    leaves = Leaves(nodes.chosen, nodes.charge, nodes.low, nodes.high, bound)
+    return leaves, Rest(term, value, residual[:, :, 0], inverse)
+
+
+def with_one_more(level: int, nodes: Nodes, rest: Rest, squares: Squares, terms: Terms) -> Array:
+    """What nodes without least sizes cost with one more move from `level` on alone, shape (N, n - level).
+
+    Without prices. With r_t the gradient when no move follows and q_t the curvature left when the others adapt, t gains
+    r_t^2 / q_t.
+    """
+    gradient = rest.residual @ squares.L[level:, level:-1]
+    across = squares.normal[level:-1][:, nodes.chosen].transpose(1, 0, 2) @ nodes.root
+    q = squares.curvature[level:] - ((across @ rest.inverse) * across).sum(axis=2)
+    q = np.maximum(q, 1e-12 * squares.curvature[level:])
+    # The value is one of several that cancel here, so rounding counts.
+    return np.asarray(
+        rest.value[:, None] * (1 - 1e-12) - gradient * gradient / q - terms.support[level:-1, rest.term].T
+    )
+
+
+def appraised(leaves: Leaves, squares: Squares, terms: Terms, columns: list[int]) -> Leaves:
+    """The leaves bounded with these terms."""
+    chosen = leaves.chosen
+    none, diagonal = chosen < 0, np.arange(chosen.shape[1])
+    normal = squares.normal[chosen[:, :, None], chosen[:, None, :]]
+    normal[:, diagonal, diagonal] += none
+    inverse = np.linalg.inv(normal)
+    A = squares.L[:, chosen].transpose(1, 0, 2)
+    residual = np.repeat(terms.c[None, :, columns], len(chosen), axis=0)
+    d = np.zeros((*chosen.shape, len(columns)))
+    for _ in range(2 if squares.refined else 1):
+        step = inverse @ (A.transpose(0, 2, 1) @ residual)
+        d += step
+        residual -= A @ step
+    value = np.square(residual).sum(axis=1) + terms.rest[columns] + leaves.charge[:, None]
+    if leaves.low.shape[1]:
+        variance = np.where(none, 0.0, np.diagonal(inverse, axis1=1, axis2=2))
+        value += lift(leaves.low, leaves.high, d, variance)
+        s = terms.s[:, columns][chosen]
+        value -= np.maximum(s * leaves.low[:, :, None], s * leaves.high[:, :, None]).sum(axis=1)
+    else:
+        value -= terms.support[:, columns][chosen].sum(axis=1)
+    return leaves._replace(bound=np.maximum(leaves.bound, value.max(axis=1)))
+
+
+def together(first: Leaves, second: Leaves) -> Leaves:
+    """Both, of patterns without least sizes."""
+    size, w = len(first.bound), max(first.chosen.shape[1], second.chosen.shape[1])
+    chosen = np.full((size + len(second.bound), w), -1)
+    chosen[:size, : first.chosen.shape[1]] = first.chosen
+    chosen[size:, : second.chosen.shape[1]] = second.chosen
+    others = [np.concatenate(pair) for pair in zip(first[1:], second[1:], strict=True)]
+    return Leaves(chosen, *others)
