@@ -32,7 +32,7 @@ FREE_MOVES = 5  # control horizon of plain MPC
 CONDITION = 500.0  # of the program that the move weight of plain MPC aims at, as in dynamic matrix control
 
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
-MOVED = 0.03  # share of the inputs' range that set-points ask for, either way
+MOVED = 0.02  # share of the inputs' range that set-points ask for, either way
 CHANGES = 4  # set-point changes of a scenario
 LENGTHS = (160, 300)  # fewest and most samples of a scenario
 HORIZONS_LONG = 5  # a scenario lasts that many prediction horizons, within these

@@ -249,7 +249,7 @@ def tune(
         noise: standard deviation of the measurement noise, scalar or (l,); default `model.noise`, else a 500th of
             what the inputs' whole range does to an output.
         reference_changes: set-points differ from the operating point by up to these, scalar or (l,), output units;
-            default what 3 % of the inputs' range does.
+            default what 2 % of the inputs' range does.
         loads: of `mampc.loads`, all in every scenario, or lists of them, which scenarios take in turn; () for none.
             Default steps, a random walk, coloured noise and none in turn, sized by noise and gain.
         baseline: a regulator with plain MPC to compare with, whose horizons, weights and limits hold; default from
