@@ -20,7 +20,6 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
-from mampc.program.daqp import active_bounds
 from mampc.program.limits_now import InputRange, LimitsNow, UsualLimits
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.sample import Indices, Sample
@@ -245,11 +244,16 @@ class Controller(ABC):
             if self._du_max is not None:
                 changes = np.minimum(np.maximum(changes, -self._du_max), self._du_max)
             # Sums in this order leave an input that does not move exactly where it was.
-            planned = np.concatenate((applied, changes)).cumsum(axis=0)[1:]
+            planned = np.add.accumulate(changes)
+            planned += applied
         planned = planned.reshape(self._shape)
         kept = inputs.clipped(planned)
-        clipped = kept - planned
-        if clipped.any() and (np.abs(clipped) > self._resolution + ROUNDED * np.abs(planned)).any():
+        if (
+            kept.tobytes() != planned.tobytes()
+            and (  # nearly always the same bits
+                np.abs(kept - planned) > self._resolution + ROUNDED * np.abs(planned)
+            ).any()
+        ):
             # Planned beyond what counts as a number: this is another plan, of which nothing is proven.
             changes = np.diff(kept, axis=0, prepend=applied)
             status, lower_bound, objective, violations = Status.FEASIBLE, -np.inf, None, None
@@ -268,7 +272,7 @@ class Controller(ABC):
 
     def _to_hold(self, plan: Plan, sample: Sample | None, state: ControllerState, inputs: InputRange) -> Plan:
         """The plan to hold the inputs, or the nearest ones within their limits."""
-        planned = inputs.held(state.inputs[-1], self._shape[0])
+        planned = inputs.held(state.inputs[-1])
         moves, remarks = np.diff(planned, axis=0, prepend=state.inputs[-1:]).ravel(), plan.remarks
         if (np.abs(moves.reshape(self._shape)) > self._resolution).any():
             remarks = (*remarks, Remark.BACK_INSIDE)
@@ -311,11 +315,11 @@ class Controller(ABC):
         if margins[margins.argmin()] > INSIDE:
             return Plan(sample.moves, Status.OPTIMAL, 0, None, None, sample.inputs, sample.cost)
         nearest = self.condensed.plain.solve(sample.moves, sample.lower, sample.upper, state.active)
-        if nearest.moves is None or nearest.multipliers is None:
+        if nearest.moves is None:
             return Plan(None, HELD_BY[nearest.status], nearest.iterations)
         return Plan(
             nearest.moves, Status.OPTIMAL, nearest.iterations, None, None, None, sample.cost + nearest.excess, (),
-            active_bounds(nearest.multipliers), None, None if nearest.violated else self._no_violations,
+            nearest.active, None, None if nearest.violated else self._no_violations,
         )  # fmt: skip
 
     def _unrestricted_but_frozen(self, sample: Sample, frozen: Indices) -> Plan:

@@ -73,6 +73,7 @@ class MAMPC(Controller):
             rules, problem.model.n_inputs, problem.control_horizon, self.condensed.input_prefix
         )
         self._check_sizes()
+        self._rounding = ROUNDING * self.condensed.move_prefix
         # Without any rule this is plain MPC.
         self._search = None if self._admissible.unrestricted else self.method.prepare(self.condensed, rules)
 
@@ -105,8 +106,7 @@ class MAMPC(Controller):
         """The plan without moves that are too small to count."""
         if plan.moves is None:
             return plan
-        size = np.abs(plan.moves) / self.condensed.move_prefix
-        if np.count_nonzero(size > ROUNDING) == np.count_nonzero(size):
+        if np.count_nonzero(np.abs(plan.moves) > self._rounding) == np.count_nonzero(plan.moves):
             return plan
         moves = without_rounding(self.condensed, sample, plan.moves)
         return plan._replace(moves=moves, inputs=None, objective=None)

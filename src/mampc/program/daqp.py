@@ -22,7 +22,7 @@ _STATUS = {
     -4: QPStatus.ITERATION_LIMIT,
     -7: QPStatus.TIME_LIMIT,
 }
-ACTIVE_BELOW = 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
+ACTIVE_ABOVE, ACTIVE_BELOW = 1.0, 3.0  # daqp's flags: 1 for active, and 2 for at its lower bound
 ROUNDING = 5e-9  # relative to the sizes of the data: how far an optimum may miss its conditions
 ORDINARY = 1e8  # length of f: up to here what daqp calls an optimum is one, and only longer ones are checked
 GONE = 1e18  # a bound beyond it is none, in whatever units
@@ -44,6 +44,7 @@ class DaqpSolver:
         time_limit: seconds a solve may take, None for no limit.
         iteration_limit: active-set changes a solve may take.
         tolerance: to within which bounds are kept, in daqp's units.
+        keeps_data: whether the arrays given to `solve` are contiguous and nobody else's, so that it may keep them.
 
     Raises:
         MampcError: daqp refuses the program.
@@ -56,6 +57,7 @@ class DaqpSolver:
         time_limit: float | None = None,
         iteration_limit: int = 10_000,
         tolerance: float = 1e-9,
+        keeps_data: bool = False,
     ) -> None:
         self.program = program
         self._settings = {
@@ -64,6 +66,7 @@ class DaqpSolver:
             "time_limit": 0.0 if time_limit is None else time_limit,
         }
         self._units, self._per_unit = _even_units(program)
+        self._keeps_data = keeps_data and self._units is None
         self._inactive = np.zeros(program.n_bounds, dtype=np.intc)
         self._f_shape = (program.n_variables,)
         self._bound_shape = (program.n_bounds,)
@@ -85,11 +88,13 @@ class DaqpSolver:
                 f"received {f.shape}, {lower.shape}, {upper.shape}"
             )
         # Both comparisons are false for not-a-number; f beyond 1e154 is as good as infinite.
-        square = f.dot(f)
-        if not (square < np.inf and (lower <= upper).all()):
+        square, apart = f.dot(f), lower <= upper
+        if not square < np.inf:
             return _BAD_DATA
         if not len(lower):  # daqp wants at least one row
             return QPSolution(-np.linalg.solve(self.program.H, f), lower, QPStatus.OPTIMAL, 0)
+        if not apart[apart.argmin()]:
+            return _BAD_DATA
         model = getattr(self._local, "model", None)
         if model is None:
             model = self._local.model = self._fresh_model()
@@ -99,9 +104,7 @@ class DaqpSolver:
         if active is self._inactive:
             changed["sense"] = active
         elif active is not None:
-            # A bound that went away since cannot be started from.
-            there = np.where(active == ACTIVE_BELOW, lower > -GONE, upper < GONE)
-            changed["sense"] = np.where(there, active, 0).astype(np.intc)
+            changed["sense"] = _there(active, lower, upper)
         flag = model.update(**changed)
         if flag < 0:
             self._local.model = None
@@ -142,6 +145,8 @@ class DaqpSolver:
 
     def _changed(self, f: Array, lower: Array, upper: Array) -> dict[str, Any]:
         """The data in daqp's units. It reads contiguous doubles and keeps references: these are its own copies."""
+        if self._keeps_data:
+            return {"f": f, "blower": lower, "bupper": upper}
         if self._units is None:
             return {"f": _own(f), "blower": _own(lower), "bupper": _own(upper)}
         return {"f": f * self._units, "blower": lower * self._per_unit, "bupper": upper * self._per_unit}
@@ -169,7 +174,10 @@ class DaqpSolver:
         )
 
     def start(self, active: Array | None = None) -> None:
-        """Begin anew: the next solve starts from these active bounds, as `active_bounds` gives them, default none."""
+        """Begin anew: the next solve starts from these active bounds, default none.
+
+        They are flags, shape (n_bounds,): 1 at an upper, 3 at a lower bound, else 0.
+        """
         self._local.active = self._inactive if active is None else active
 
     def _fresh_model(self) -> Any:
@@ -192,7 +200,7 @@ class DaqpSolver:
         return model
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"program": self.program, "settings": self._settings}
+        return {"program": self.program, "settings": self._settings, "keeps_data": self._keeps_data}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         settings = state["settings"]
@@ -201,6 +209,7 @@ class DaqpSolver:
             time_limit=settings["time_limit"] or None,
             iteration_limit=settings["iter_limit"],
             tolerance=settings["primal_tol"],
+            keeps_data=state["keeps_data"],
         )
 
 
@@ -221,14 +230,23 @@ def _even_units(program: QuadraticProgram) -> tuple[Array | None, Array]:
 
 
 def active_bounds(multipliers: Array) -> Array:
-    """Which bounds hold a solution with these multipliers: 1 at an upper, 3 at a lower bound, else 0."""
-    active: Array = (multipliers > 0) + ACTIVE_BELOW * (multipliers < 0)
-    return active.astype(np.float64)
+    """Which bounds hold a solution with these multipliers, as flags of `DaqpSolver.start`."""
+    active: Array = ACTIVE_ABOVE * (multipliers > 0) + ACTIVE_BELOW * (multipliers < 0)
+    return active
+
+
+def _there(active: Array, lower: Array, upper: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.intc]]:
+    """The active bounds but for those that went away since, which cannot be started from."""
+    flags = active.astype(np.intc)
+    for i in flags.nonzero()[0].tolist():
+        if lower[i] <= -GONE if flags[i] == ACTIVE_BELOW else upper[i] >= GONE:
+            flags[i] = 0
+    return flags
 
 
 def active_flags(active: Array | None) -> bool:
-    """Whether an array is one that `active_bounds` may have given, or None."""
-    return active is None or bool(np.isin(active, (0.0, 1.0, ACTIVE_BELOW)).all())
+    """Whether an array holds flags as `DaqpSolver.start` takes them, or is None."""
+    return active is None or bool(np.isin(active, (0.0, ACTIVE_ABOVE, ACTIVE_BELOW)).all())
 
 
 def _own(array: Array) -> Array:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.program.daqp import DaqpSolver
+from mampc.program.daqp import ACTIVE_ABOVE, ACTIVE_BELOW, DaqpSolver, active_bounds
 from mampc.program.qp import QPSolution, QPStatus, QuadraticProgram
 from mampc.program.refinement import refined
 
@@ -40,6 +40,7 @@ class Nearest(NamedTuple):
     status: QPStatus
     iterations: int
     violated: bool = False  # whether some violation is above zero
+    active: Array | None = None  # bounds that hold the moves, flags of `DaqpSolver.start`, shape (bounds,)
 
 
 class LeastDistance:
@@ -79,7 +80,10 @@ class LeastDistance:
         self._even = np.concatenate([np.full(v, 1 / self._per_violation), even])
         self._f = np.concatenate([np.full(v, weight * self._per_violation), np.zeros(k)])
         self._solver = DaqpSolver(
-            QuadraticProgram(2 * np.eye(v + k), self._A, v), time_limit=time_limit, tolerance=SLACK
+            QuadraticProgram(2 * np.eye(v + k), self._A, v),
+            time_limit=time_limit,
+            tolerance=SLACK,
+            keeps_data=True,
         )
 
     def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
@@ -92,27 +96,28 @@ class LeastDistance:
             high /= scale
         self._solver.start(active)
         solution = self._solver.solve(f, low, high)
-        z, pull = solution.z, solution.multipliers
+        z, pull, status, iterations = solution
         if z is None or pull is None:
-            if (
-                solution.status in (QPStatus.INFEASIBLE, QPStatus.FAILED, QPStatus.ITERATION_LIMIT)
-                and self._doubtful
-            ):
+            if status in (QPStatus.INFEASIBLE, QPStatus.FAILED, QPStatus.ITERATION_LIMIT) and self._doubtful:
                 return self._tried_again(optimum, lower, upper, solution)
-            return Nearest(None, np.inf, None, solution.status, solution.iterations)
+            return Nearest(None, np.inf, None, status, iterations)
         delta = z[v:] * scale
-        excess, violated = float(delta.dot(delta)), bool(v and z[:v].max() > 0)
+        excess, violated = float(delta.dot(delta)), bool(v and z[z[:v].argmax()] > 0)
         if violated:
             excess += self._penalty(z[:v] * (scale * self._per_violation))
         multipliers = pull * (scale * self._even)
         if self._doubtful:
             slack = np.where(pull > 0, high, low)[v:] - self._A.dot(z)
             if scale * scale * np.abs(pull[v:]).dot(np.abs(slack)) > UNCERTAIN * excess:
-                return self._refined(optimum, lower, upper, multipliers, solution.iterations)
-        moves = optimum + self._inverse.dot(delta)
-        for i in np.flatnonzero(pull[v : v + self._n_simple]):
-            moves[i] = upper[v + i] if pull[v + i] > 0 else lower[v + i]
-        return Nearest(moves, excess, multipliers, solution.status, solution.iterations, violated)
+                return self._refined(optimum, lower, upper, multipliers, iterations)
+        moves, active = self._inverse.dot(delta), np.zeros(len(pull))
+        moves += optimum
+        for i in pull.nonzero()[0].tolist():
+            above = pull[i] > 0
+            active[i] = ACTIVE_ABOVE if above else ACTIVE_BELOW
+            if v <= i < v + self._n_simple:
+                moves[i - v] = upper[i] if above else lower[i]
+        return Nearest(moves, excess, multipliers, status, iterations, violated, active)
 
     def _penalty(self, violations: Array) -> float:
         a = np.maximum(violations, 0.0)
@@ -156,7 +161,8 @@ class LeastDistance:
         excess, violated = float(delta.dot(delta)), bool(v and better.z[:v].max() > 0)
         if violated:
             excess += self._penalty(better.z[:v])
-        return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated)
+        active = active_bounds(better.multipliers)
+        return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated, active)
 
     def relaxed(self, optimum: Array, lower: Array, upper: Array, multipliers: Array) -> tuple[Array, float]:
         """The optimum with limits priced by multipliers: its delta, and its cost beyond that of the optimum without."""
@@ -183,7 +189,8 @@ class LeastDistance:
         """
         if len(low) == self._v:
             return 1.0
-        far = max(float(low[self._v :].max()), -float(high[self._v :].min()))
+        low, high = low[self._v :], high[self._v :]
+        far = max(float(low[low.argmax()]), -float(high[high.argmin()]))
         if not (isfinite(far) and far > (1.0 if self._v else 0.0)):
             return 1.0
         return float(2.0 ** frexp(far)[1])

@@ -15,12 +15,12 @@ from mampc.program.sample import BoundsNow, Sample
 
 
 class InputRange:
-    """Least and largest inputs at one sample, shape (m,), or (nc, m) where they vary over the horizon.
+    """Least and largest inputs over the horizon, at one sample.
 
     Inputs in manual may be held beyond it. Nobody plans to move them, so plans leave them where they are.
 
     Args:
-        low, high: what inputs to apply are kept within.
+        low, high: what inputs to apply are kept within, shape (nc, m).
         left_alone: the inputs that plans leave beyond it, bool, shape (m,); None for none.
     """
 
@@ -29,25 +29,23 @@ class InputRange:
         if left_alone is not None:
             low, high = np.where(left_alone, -LARGEST, low), np.where(left_alone, LARGEST, high)
         self.low, self.high = low, high
-        self._first = low.reshape(-1, low.shape[-1])[0], high.reshape(-1, high.shape[-1])[0]
-        self._first_pairs = list(zip(self._first[0].tolist(), self._first[1].tolist(), strict=True))
+        self._first = list(zip(low[0].tolist(), high[0].tolist(), strict=True))
 
     def holds(self, u: Array) -> bool:
         """Whether inputs u, shape (m,), are within the range of the first sample, those left alone aside."""
-        return all(
-            low <= value <= high for value, (low, high) in zip(u.tolist(), self._first_pairs, strict=True)
-        )
+        for value, (low, high) in zip(u.tolist(), self._first, strict=True):  # noqa: SIM110 - twice as fast
+            if not low <= value <= high:
+                return False
+        return True
 
     def nearest(self, u: Array) -> Array:
         """The inputs within the range of the first sample nearest to u, shape (m,); those left alone stay."""
-        return np.asarray(np.minimum(np.maximum(u, self._first[0]), self._first[1]))
+        return np.asarray(np.minimum(np.maximum(u, self.low[0]), self.high[0]))
 
-    def held(self, u: Array, samples: int) -> Array:
-        """Inputs, shape (samples, m), that stay at u, shape (m,), but where the range makes them move."""
-        shape, rows = (samples, len(u)), []
-        for low, high in zip(
-            np.broadcast_to(self.low, shape), np.broadcast_to(self.high, shape), strict=True
-        ):
+    def held(self, u: Array) -> Array:
+        """Inputs, shape (nc, m), that stay at u, shape (m,), but where the range makes them move."""
+        rows = []
+        for low, high in zip(self.low, self.high, strict=True):
             u = np.minimum(np.maximum(u, low), high)
             rows.append(u)
         return np.array(rows)
@@ -58,17 +56,15 @@ class InputRange:
 
     def applied(self, plan: Array) -> Array:
         """The inputs to apply, shape (m,): the first planned ones, and within the range every one of them."""
-        if self._left_alone is None:
-            first: Array = plan[0]
-            return first
-        low, high = np.atleast_2d(self._low)[0], np.atleast_2d(self._high)[0]
-        u = np.asarray(np.minimum(np.maximum(plan[0], low), high))
-        u.setflags(write=False)
+        u: Array = plan[0]
+        if self._left_alone is not None:
+            u = np.minimum(np.maximum(u, self._low[0]), self._high[0])
+            u.setflags(write=False)
         return u
 
     def leaving(self, manual: BoolArray, u: Array) -> InputRange:
         """The same range, with inputs in manual, shape (m,), left where u, shape (m,), is beyond it at some sample."""
-        beyond = manual & np.atleast_2d((u < self._low) | (u > self._high)).any(axis=0)
+        beyond = manual & ((u < self._low) | (u > self._high)).any(axis=0)
         return InputRange(self._low, self._high, manual) if beyond.any() else self
 
 
@@ -83,10 +79,11 @@ class UsualLimits:
     crossed = False
 
     def __init__(self, condensed: CondensedQP) -> None:
-        limits = condensed.problem.limits
+        limits, shape = condensed.problem.limits, (condensed.problem.control_horizon, 1)
         self._condensed = condensed
         self.inputs = InputRange(
-            np.maximum(limits.u_min, -LARGEST / 2), np.minimum(limits.u_max, LARGEST / 2)
+            np.tile(np.maximum(limits.u_min, -LARGEST / 2), shape),
+            np.tile(np.minimum(limits.u_max, LARGEST / 2), shape),
         )
 
     def applied_to(self, sample: Sample) -> Sample:

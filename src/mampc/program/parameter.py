@@ -44,13 +44,14 @@ class Parameter:
         ) = (slice(end - size, end) for size, end in zip(sizes, ends, strict=True))  # fmt: skip
         self.size = ends[-1]
         self.final_reference = slice(self.size - l, self.size)
-        usual: tuple[Array, ...] = (np.zeros(m), np.zeros(l), model.v_op, np.ones(1))  # d_u, d_y, v, 1
-        self._usual = usual
-        self._usual_together = np.concatenate(self._usual)
         origin = np.zeros(self.size)
         origin[self.u_deviation], origin[self.measured_disturbance] = model.u_op, model.v_op
         origin[self.reference] = np.tile(model.y_op, problem.prediction_horizon + 1)
         self.origin = {len(at): at for at in (origin, origin[: self.reference.start + l])}
+        usual = np.zeros(self.size)  # no disturbances, and the measured ones of the operating point
+        usual[self.measured_disturbance], usual[self.one] = model.v_op, 1.0
+        self._usual = {len(at): usual[: len(at)] for at in self.origin.values()}
+        self._sizes = {"d_u": (m,), "d_y": (l,), "v": (len(model.v_op),)}
 
     def vector(
         self,
@@ -64,19 +65,23 @@ class Parameter:
         """p; all arguments in engineering units, the reference (l,) or (np + 1, l), disturbances may be left out."""
         if reference.ndim == 2:
             reference = reference.ravel()
-        if output_disturbance is None and input_disturbance is None and measured_disturbance is None:
-            vector: Array = np.concatenate((x, u_previous, u_previous, self._usual_together, reference))
-            vector -= self.origin[len(vector)]
-            return vector
-        d_u, d_y, v, one = self._usual
+        start, sizes = self.reference.start, self._sizes
+        size = start + len(reference)
+        vector = self._usual[size].copy()
+        vector[self.x] = x
+        vector[self.u_previous] = vector[self.u_deviation] = u_previous
+        vector[start:] = reference
         if input_disturbance is not None:
-            d_u = as_shaped("input_disturbance", input_disturbance, d_u.shape)
+            vector[self.input_disturbance] = as_shaped("input_disturbance", input_disturbance, sizes["d_u"])
         if output_disturbance is not None:
-            d_y = as_shaped("output_disturbance", output_disturbance, d_y.shape)
+            vector[self.output_disturbance] = as_shaped(
+                "output_disturbance", output_disturbance, sizes["d_y"]
+            )
         if measured_disturbance is not None:
-            v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
-        vector = np.concatenate((x, u_previous, u_previous, d_u, d_y, v, one, reference))
-        vector -= self.origin[len(vector)]
+            vector[self.measured_disturbance] = as_shaped(
+                "measured_disturbance", measured_disturbance, sizes["v"]
+            )
+        vector -= self.origin[size]
         return vector
 
     def no_map(self, rows: int) -> Array:

@@ -83,16 +83,16 @@ class Restriction:
         Args:
             optimum: `optimum` of the sample.
             lower, upper: the bounds that are kept.
-            active: bounds to start from, as `active_bounds` gives them, shape (n_bounds,).
+            active: bounds to start from, flags of `DaqpSolver.start`, shape (n_bounds,).
 
         Returns:
-            As `LeastDistance`, the multipliers of all bounds, shape (n_bounds,).
+            As `LeastDistance`, multipliers and active bounds being those of all bounds, shape (n_bounds,).
         """
-        if active is not None:
-            active = active[self.bounds]
-        nearest = self.program.solve(optimum, lower, upper, active)
-        if nearest.multipliers is None or len(self.bounds) == self._n_bounds:
+        if len(self.bounds) == self._n_bounds:
+            return self.program.solve(optimum, lower, upper, active)
+        nearest = self.program.solve(optimum, lower, upper, None if active is None else active[self.bounds])
+        if nearest.multipliers is None:
             return nearest
-        multipliers = np.zeros(self._n_bounds)
-        multipliers[self.bounds] = nearest.multipliers
-        return nearest._replace(multipliers=multipliers)
+        multipliers, active = np.zeros(self._n_bounds), np.zeros(self._n_bounds)
+        multipliers[self.bounds], active[self.bounds] = nearest.multipliers, nearest.active
+        return nearest._replace(multipliers=multipliers, active=active)
