@@ -132,6 +132,7 @@ def assert_keeps_limits_and_rules(case, decision):
     assert keeps_rules(rules, past, moves)
 
 
+@pytest.mark.slow
 def test_the_random_cases_often_have_each_limit_active_and_each_rule_binding():
     active = dict.fromkeys(("u", "du_max", "min_size", "output", "violation"), 0)
     binding = dict.fromkeys(RULES, 0)
@@ -196,6 +197,7 @@ def larger_case(seed):
     return Case(problem, rules, past, rng.standard_normal(4), model.y_op + 2 * rng.standard_normal(m))
 
 
+@pytest.mark.slow
 def test_scip_brackets_the_optimum_of_larger_problems():
     both = 0
     for seed in range(40):
