@@ -6,7 +6,7 @@ Every row states a target and what was measured. Both sides of a ratio run in sh
 so that whatever else the machine does hits both alike; the figure is the median over blocks of the
 ratio of the blocks' median times per call. To add a row, write a function that returns a `Row` and
 append it to `ROWS`. `measuring` says how times are taken, `sparse` has the rows of the exact method and heuristics,
-`batches` those of many loops.
+`batches` those of many loops, `solvers` those of other solvers.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from rich.table import Table
 
 import batches
 import mampc
+import solvers
 import sparse
 from measuring import LAMBDA, Asked, Row, closed_loop, interleaved, steps_of, tank_problem
 
@@ -209,6 +210,7 @@ ROWS: list[Callable[[], Row]] = [
     load_bank_against_filter,
     alternating_against_cvxpy,
     *batches.ROWS,
+    *solvers.ROWS,
     *sparse.ROWS,
     import_time,
 ]

@@ -238,8 +238,10 @@ def active_bounds(multipliers: Array) -> Array:
 def _there(active: Array, lower: Array, upper: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.intc]]:
     """The active bounds but for those that went away since, which cannot be started from."""
     flags = active.astype(np.intc)
-    for i in flags.nonzero()[0].tolist():
-        if lower[i] <= -GONE if flags[i] == ACTIVE_BELOW else upper[i] >= GONE:
+    at = flags.nonzero()[0]
+    limits = zip(at.tolist(), active[at].tolist(), lower[at].tolist(), upper[at].tolist(), strict=True)
+    for i, flag, low, high in limits:
+        if low <= -GONE if flag == ACTIVE_BELOW else high >= GONE:
             flags[i] = 0
     return flags
 
