@@ -106,11 +106,11 @@ class Decision(NamedTuple):
         return id(self)
 
     def __repr__(self) -> str:
-        told = [f"u={np.array2string(self.u, precision=6, threshold=8)}", str(self.status)]
-        told.append(f"{np.count_nonzero(self.moves)} of {self.moves.size} moves")
+        words = [f"u={np.array2string(self.u, precision=6, threshold=8)}", str(self.status)]
+        words.append(f"{np.count_nonzero(self.moves)} of {self.moves.size} moves")
         if not self.held:
-            told.append(f"objective={self.objective:.6g}")
-            told.append("no bound" if self.gap == np.inf else f"gap={self.gap:.3g}")
-        told += [str(remark) for remark in self.remarks]
-        told += [f"{name} {fault}" for name, fault in self.ignored_outputs.items()]
-        return f"Decision({', '.join(told)})"
+            words.append(f"objective={self.objective:.6g}")
+            words.append("no bound" if self.gap == np.inf else f"gap={self.gap:.3g}")
+        words += [str(remark) for remark in self.remarks]
+        words += [f"{name} {fault}" for name, fault in self.ignored_outputs.items()]
+        return f"Decision({', '.join(words)})"

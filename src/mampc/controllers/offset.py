@@ -1,7 +1,7 @@
 """How large an offset a price can leave for good.
 
-At rest with an offset e = r - y, an exact controller that does not move now costs at least (L + 1) |e|^2_Q, L being
-the `tail_horizon`: it holds, which costs (np + 1 + L) |e|^2_Q, or it plans to move later; and then the same
+In steady state with an offset e = r - y, an exact controller that does not move now costs at least (L + 1) |e|^2_Q, L
+being the `tail_horizon`: it holds, which costs (np + 1 + L) |e|^2_Q, or it plans to move later; and then the same
 plan one sample earlier would cost no less only if the offset at its end were no smaller than e, so that its
 tail alone costs L |e|^2_Q. Moving every input to its target at once costs the prices of all inputs and e' M e, M being
 the transient. What the optimum does not remove therefore satisfies
@@ -23,7 +23,7 @@ from mampc.program.problem import TrackingProblem
 def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     """The largest offset of each output, shape (l,), that the price can leave for good, in output units.
 
-    It holds for `method="exact"` at rest, model and disturbances constant, wherever limits leave room to
+    It holds for `method="exact"` in steady state, model and disturbances constant, wherever limits leave room to
     remove the offset. It is infinite where nothing is promised: the tail horizon is short against the transient,
     the model has fewer inputs than outputs (or poles at one), or the rules may forbid to move all inputs
     at once (`max_moves`, `max_moves_per_step`), by less than `min_size`, or at any sample (`blocks`).
@@ -36,8 +36,8 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     nothing = np.full(l, np.inf)
     all_at_once = np.zeros(admissible.n_moves, dtype=bool)
     all_at_once[:m] = True
-    rested = admissible.allowance(np.zeros((rules.memory, m)))
-    promised = admissible.allows(all_at_once, rested) and not admissible.sized and rules.blocks is None
+    unmoved = admissible.allowance(np.zeros((rules.memory, m)))
+    promised = admissible.allows(all_at_once, unmoved) and not admissible.sized and rules.blocks is None
     stable = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0) < 1 - 1e-9
     if not promised or not stable or m < l:
         return nothing
@@ -56,7 +56,7 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
 
 
 def largest_saving(condensed: CondensedQP, change: Array) -> float:
-    """The most cost that any moves can save at rest after the reference changes by `change`, shape (l,).
+    """The most cost that any moves can save in steady state after the reference changes by `change`, shape (l,).
 
     It is what the optimum without limits and prices saves of the cost of holding the inputs. Where a single move
     is priced higher, none is ever made.
