@@ -41,7 +41,10 @@ def measure(seed: int) -> Result:
     case = case_of(seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mampc.MampcWarning)
-        controller = mampc.MAMPC(case.problem, case.rules)
+        try:
+            controller = mampc.MAMPC(case.problem, case.rules)
+        except mampc.MampcError:
+            return Result(case.kind, "refused", 0.0, 0.0, -np.inf)
     decision = controller.step(controller.initial_state(case.past), case.x, case.reference)
     condition = controller.condensed.condition
     if decision.status.startswith("held"):
@@ -57,6 +60,8 @@ def main() -> None:
     first, last = (int(argument) for argument in sys.argv[1:] or (0, 2000))
     calls = Parallel(n_jobs=-1, return_as="generator")(delayed(measure)(seed) for seed in range(first, last))
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=120)
     results = defaultdict(list)
     for result in track(calls, total=last - first, console=Console(stderr=True), description="instances"):
         results[result.kind].append(result)

@@ -73,12 +73,14 @@ def case_of(seed):
         "blocks": (1, n_c - 1),
         "min_size": float(10 ** rng.uniform(-2, 0)),
     }
-    rules = mampc.MoveRules(**{name: options[name] for name in used})
     u = model.u_op + rng.uniform(-1, 1, m) * (rng.random() < 0.5)
     limits = {}
     if limited:
         size = 10 ** rng.uniform(-1.5, 0.5)
         limits = {"u_min": u - size * rng.uniform(0, 1, m), "u_max": u + size * rng.uniform(0.3, 1, m)}
+    if limited:  # a larger move would never be possible
+        options["min_size"] = min(options["min_size"], 0.9 * float((limits["u_max"] - limits["u_min"]).min()))
+    rules = mampc.MoveRules(**{name: options[name] for name in used})
     problem = mampc.TrackingProblem(
         model, prediction_horizon=n_p, control_horizon=n_c, output_weight=weight, move_weight=move_weight,
         limits=mampc.Limits(**limits), tail_horizon=float(rng.choice([0, 0, 10.0])) if pole <= 1 else 0.0,

@@ -2,10 +2,11 @@
 
     minimise |F z - c|^2  subject to  low <= A z <= high
 
-A dual solver keeps bounds to a tolerance, and where rows are nearly parallel (an unstable plant: every input must do
-nearly the same) a little slack is worth a lot of cost. Here active bounds are met by the null-space method: with
-A_W' = Q R, z = Q1 R^-T b + Q2 y, and y solves a least-squares problem of F Q2. A bound that pulls the wrong way is
-dropped, one that is broken is taken up, until the optimality conditions hold.
+A fast dual solver keeps bounds to a tolerance, and where rows are nearly parallel (an unstable plant: every input must
+do nearly the same) a little slack is worth a lot of cost. This is the dual method of Goldfarb and Idnani (Mathematical
+Programming 27, 1983) with every point worked out anew by the null-space method: with A_W' = Q R on the active bounds W,
+z = Q1 R^-T b + Q2 y, and y solves a least-squares problem of F Q2. So neither the condition of F is squared nor do
+steps add up rounding.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray
+from mampc.base.checks import Array
 
 BROKEN = 1e-11  # of the sizes in a row: a bound missed by more is not kept
 WRONG = 1e-11  # of the largest multiplier: one of the wrong sign by more is wrong
-DEPENDENT = 1e-13  # of a row's length: what others leave of it, when it says nothing new
+DEPENDENT = 1e-12  # of a row's length: what others leave of it, when it says nothing new
 
 
 class Refined(NamedTuple):
@@ -33,50 +34,94 @@ def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array, 
     length = np.sqrt(np.square(A).sum(axis=1))
     length[length == 0] = 1.0
     A, low, high = A / length[:, None], low / length, high / length
-    sign = np.sign(pull * length)
+    signs = {int(i): float(np.sign(pull[i])) for i in np.flatnonzero(pull)}
+    factor: Array = np.asarray(np.linalg.qr(F, mode="r"))
     for _ in range(most):
-        solved = _equality(F, c, A, np.where(sign > 0, high, low), sign != 0)
+        solved = _at(F, c, A, low, high, signs)
         if solved is None:
             return None
-        z, multipliers = solved
-        wrong = -multipliers * sign
-        if (at := int(wrong.argmax())) >= 0 and wrong[at] > WRONG * np.abs(multipliers).max():
-            sign[at] = 0.0
+        z, u, signs = solved
+        size = max(u.values(), default=0.0)
+        wrong = min(u, key=lambda i: u[i], default=-1)
+        if wrong >= 0 and u[wrong] < -WRONG * max(size, -u[wrong]):
+            del signs[wrong]
             continue
-        rows, size = A @ z, np.abs(A) @ np.abs(z)
-        above, below = rows - high - BROKEN * size, low - rows - BROKEN * size
-        above[sign != 0], below[sign != 0] = -np.inf, -np.inf
-        up, down = int(above.argmax()), int(below.argmax())
-        if above[up] <= 0 and below[down] <= 0:
+        rows = A @ z
+        excess = np.maximum(rows - high, low - rows) - BROKEN * (np.abs(A) @ np.abs(z))
+        excess[list(signs)] = -np.inf
+        worst = int(excess.argmax())
+        if excess[worst] <= 0:
+            multipliers = np.zeros(len(A))
+            for i, sign in signs.items():
+                multipliers[i] = sign * u[i]
             return Refined(z, multipliers / length)
-        if above[up] >= below[down]:
-            sign[up] = 1.0
-        else:
-            sign[down] = -1.0
+        if not _taken_up(
+            factor, A, signs, u, worst, 1.0 if rows[worst] > high[worst] else -1.0, excess[worst]
+        ):
+            return None
     return None
 
 
-def _equality(F: Array, c: Array, A: Array, b: Array, active: BoolArray) -> tuple[Array, Array] | None:
-    """The optimum where the active rows equal b, and multipliers of all rows; rows that say nothing new get none."""
-    chosen = np.flatnonzero(active)
-    independent: list[int] = []
-    basis = np.zeros((0, A.shape[1]))
-    for row in chosen:
-        rest = A[row] - (A[row] @ basis.T) @ basis
+def _taken_up(
+    factor: Array,
+    A: Array,
+    signs: dict[int, float],
+    u: dict[int, float],
+    row: int,
+    sign: float,
+    excess: float,
+) -> bool:
+    """Take a broken bound up among the active ones, and leave out those that this would make pull the wrong way.
+
+    False where nothing can keep it. `factor` is the triangular factor of F.
+    """
+    u_row = 0.0
+    while True:
+        active = list(signs)
+        normals = np.array([signs[i] * A[i] for i in active]).reshape(-1, A.shape[1])
+        normal = sign * A[row]
+        in_cost = np.linalg.solve(factor.T, np.vstack([normals, normal]).T)
+        r = np.linalg.lstsq(in_cost[:, :-1], in_cost[:, -1])[0] if active else np.zeros(0)
+        left = in_cost[:, -1] - in_cost[:, :-1] @ r
+        told = normals.T @ np.linalg.lstsq(normals.T, normal)[0] if active else 0.0 * normal
+        new = float(np.linalg.norm(normal - told)) > DEPENDENT
+        gain = float(left @ left) / 2
+        full = excess / gain if new and gain > 0 else np.inf
+        ratios = [u[i] / ri if ri > 0 else np.inf for i, ri in zip(active, r, strict=True)]
+        at = int(np.argmin(ratios)) if ratios else -1
+        step = min(full, max(ratios[at], 0.0)) if ratios else full
+        if step == np.inf:
+            return False
+        for i, ri in zip(active, r, strict=True):
+            u[i] -= step * float(ri)
+        u_row, excess = u_row + step, excess - (step * gain if new else 0.0)
+        if step == full:
+            signs[row], u[row] = sign, u_row
+            return True
+        del signs[active[at]], u[active[at]]
+
+
+def _at(
+    F: Array, c: Array, A: Array, low: Array, high: Array, signs: dict[int, float]
+) -> tuple[Array, dict[int, float], dict[int, float]] | None:
+    """The optimum on active bounds, their multipliers (positive ones pull back), and those that say something new."""
+    basis, kept = np.zeros((0, A.shape[1])), []
+    for i in signs:
+        rest = A[i] - (A[i] @ basis.T) @ basis
         rest = rest - (rest @ basis.T) @ basis
         left = float(np.sqrt(rest @ rest))
         if left > DEPENDENT:
-            independent.append(int(row))
+            kept.append(i)
             basis = np.vstack([basis, rest / left])
-    W, k = A[independent], len(independent)
+    k = len(kept)
+    W, b = A[kept], np.array([high[i] if signs[i] > 0 else low[i] for i in kept])
     Q, R = np.linalg.qr(W.T, mode="complete")
-    z = Q[:, :k] @ np.linalg.solve(R[:k].T, b[independent]) if k else np.zeros(A.shape[1])
+    z = Q[:, :k] @ np.linalg.solve(R[:k].T, b) if k else np.zeros(A.shape[1])
     if k < len(Q):
-        free = F @ Q[:, k:]
-        Q2, R2 = np.linalg.qr(free)
+        Q2, R2 = np.linalg.qr(F @ Q[:, k:])
         z = z + Q[:, k:] @ np.linalg.solve(R2, Q2.T @ (c - F @ z))
-    multipliers = np.zeros(len(A))
-    if k:
-        gradient = 2 * F.T @ (c - F @ z)
-        multipliers[independent] = np.linalg.solve(R[:k], Q[:, :k].T @ gradient)
-    return (z, multipliers) if np.isfinite(z).all() and np.isfinite(multipliers).all() else None
+    pull = np.linalg.solve(R[:k], Q[:, :k].T @ (2 * F.T @ (c - F @ z))) if k else np.zeros(0)
+    if not (np.isfinite(z).all() and np.isfinite(pull).all()):
+        return None
+    new = {i: signs[i] for i in kept}
+    return z, {i: new[i] * float(p) for i, p in zip(kept, pull, strict=True)}, new
