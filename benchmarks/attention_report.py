@@ -21,7 +21,10 @@ def write(results: Path) -> None:
     page = DOCS / "comparison.md"
     text = page.read_text(encoding="utf-8")
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    body = "\n\n".join([made_by(content["made by"]), by_load(cells, methods), by_cell(cells, methods)])
+    figure = "![Moves of the exact price over those of the best rival](images/attention.svg)"
+    body = "\n\n".join(
+        [figure, made_by(content["made by"]), by_load(cells, methods), by_cell(cells, methods)]
+    )
     page.write_text(f"{text[:start]}\n\n{body}\n\n{text[end:]}", encoding="utf-8")
     draw(cells, methods)
 
