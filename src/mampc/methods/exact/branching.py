@@ -179,8 +179,11 @@ class Branching:
             moving = out[undecided & (d != 0)]
             if left < len(moving):  # so many of them have to be left out
                 bound += float(np.sort(moving)[len(moving) - left - 1])
-        priced = of.charge(self._problem.pattern(made))
-        self._try(d, within, bound - priced - float(np.maximum(d * up, -d * down).sum()))
+        # The moves of the program, and those that are at least half of what they may be.
+        cost = bound - of.charge(self._problem.pattern(made)) - float(np.maximum(d * up, -d * down).sum())
+        self._try(np.where(within, d, 0.0), cost)
+        large = (np.maximum(d * domain.up, -d * domain.down) >= 0.5 * self._price) | made
+        self._try(np.where(large & within, d, 0.0), cost)
         return Solved(bound, d, out, adds, undecided)
 
     def _of_samples(
@@ -197,18 +200,15 @@ class Branching:
         bound = rest + float((price - pull)[paid].sum() - pull[~paid & ~open_].sum() + kept.sum())
         return bound, (adds - gains)[self._at]
 
-    def _try(self, d: Array, within: BoolArray, without_prices: float) -> None:
-        """Offer the best plan with the moves of the program that are not zero, if it may be the best one.
+    def _try(self, moves: Array, cost: float) -> None:
+        """Offer the best plan with the moves that are not zero, if they keep the rules.
 
-        Args:
-            without_prices: about the program's cost without the prices of moves that are undecided.
+        `cost` is about the least that they cost without prices: what cannot be best at that is left.
         """
-        of = self._of
-        pattern = self._problem.moving(np.where(within, d, 0.0))
+        problem, pattern = self._problem, self._problem.moving(moves)
         key = pattern.tobytes()
-        if key in self._tried:
+        if key in self._tried or cost + self._of.charge(pattern) >= problem.best.objective:
             return
         self._tried.add(key)
-        cost = without_prices + of.charge(pattern)
-        if cost < self._problem.best.objective and of.allows(pattern, self._problem.allowance):
-            self._problem.offer(pattern)
+        if self._of.allows(pattern, problem.allowance):
+            problem.offer(pattern)

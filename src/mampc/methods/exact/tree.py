@@ -30,7 +30,7 @@ from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.condensing import CondensedQP
 from mampc.program.sample import Indices, Sample
 
-CHUNK = 256  # nodes treated at once
+CHUNK = 256  # nodes treated at once; half as many where each has three children
 TOGETHER = 64  # leaves tried at once
 SHARE = 0.1  # of the time limit that one relaxed program may take
 
@@ -115,6 +115,7 @@ class _BatchSearch:
     def run(self) -> float:
         """A lower bound over everything that was not visited: infinite when the search is complete."""
         problem, n = self._problem, len(self._order)
+        chunk = CHUNK // 2 if self._of.sized else CHUNK
         root = self._bounded(0, root_of(self._terms, problem.allowance, self._of))
         pending = [(0, root, list(self._terms.ids))]
         while pending:
@@ -124,10 +125,10 @@ class _BatchSearch:
             nodes = nodes.below(problem.cutoff)
             if not len(nodes.bound):
                 continue
-            if len(nodes.bound) > CHUNK:
+            if len(nodes.bound) > chunk:
                 by_bound = np.argsort(nodes.bound, kind="stable")
-                pending.append((level, nodes.take(by_bound[CHUNK:]), ids))
-                nodes = nodes.take(by_bound[:CHUNK])
+                pending.append((level, nodes.take(by_bound[chunk:]), ids))
+                nodes = nodes.take(by_bound[:chunk])
             nodes = self._renewed(level, nodes, ids)
             ids = list(self._terms.ids)
             children, made = children_of(level, nodes, problem)
