@@ -7,6 +7,7 @@ give a valid bound, so that a few rounds do.
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -83,16 +84,19 @@ class Relaxation:
             time_limit=time_limit,
         )
 
-    def at(self, sample: Sample, optimum: Array) -> SampleRelaxation:
-        """Those of one sample, given the optimum without limits in these moves, shape (n,)."""
-        return SampleRelaxation(self, sample, optimum)
+    def at(self, sample: Sample, optimum: Array, deadline: float = np.inf) -> SampleRelaxation:
+        """Those of one sample, given the optimum without limits in these moves, shape (n,).
+
+        No signs are turned after the deadline, of `perf_counter`.
+        """
+        return SampleRelaxation(self, sample, optimum, deadline)
 
 
 class SampleRelaxation:
     """The relaxed programs of one sample; each starts from the active bounds of the last one."""
 
-    def __init__(self, of: Relaxation, sample: Sample, optimum: Array) -> None:
-        self._of, self._optimum = of, optimum
+    def __init__(self, of: Relaxation, sample: Sample, optimum: Array, deadline: float) -> None:
+        self._of, self._optimum, self._deadline = of, optimum, deadline
         v, n_simple, none = of.moves.start, of.n_simple, np.zeros(len(optimum))
         self._lower = np.concatenate((sample.lower[:v], none, sample.lower[n_simple:]))
         self._upper = np.concatenate((sample.upper[:v], none, sample.upper[n_simple:]))
@@ -124,7 +128,7 @@ class SampleRelaxation:
             # At zero the price of the other direction has to hold the move there too.
             turned = priced & np.where(positive, (pulls < -down) & (low < 0), (pulls > up) & (high > 0))
             rounds -= 1
-            if not rounds or not turned.any():
+            if not rounds or not turned.any() or perf_counter() > self._deadline:
                 self._signs = sign
                 return found._replace(pulls=pulls, free=low < high)
             sign = np.where(turned, -sign, sign)

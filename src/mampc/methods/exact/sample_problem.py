@@ -14,6 +14,8 @@ from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.sample import Indices, Sample
 
+SOON = 0.1  # of the time there is: a search that ends does so within
+
 
 class SampleProblem:
     """What is known of one sample, and the best plan so far.
@@ -43,10 +45,11 @@ class SampleProblem:
         self.squares, self.admissible, self.order = squares, admissible, squares.order
         self.sample, self.allowance, self.best = sample, allowance, best
         self._solver, self._deadline = solver, deadline
+        self._lasting_from = perf_counter() + SOON * (deadline - perf_counter())
         self.domain = Domain(squares.condensed, admissible, self.order, sample, allowance)
         self.prefix = squares.condensed.move_prefix[self.order]
         c, rest, optimum = squares.at(sample)
-        self.relaxation = relaxation.at(sample, optimum)
+        self.relaxation = relaxation.at(sample, optimum, deadline)
         self.terms = Terms(admissible, self.relaxation, self.domain, c, rest)
         self._rounding = squares.condensed.rounding(sample)
 
@@ -59,6 +62,11 @@ class SampleProblem:
     def late(self) -> bool:
         """Whether the time is up."""
         return perf_counter() > self._deadline
+
+    @property
+    def lasting(self) -> bool:
+        """Whether the search takes longer than those that end."""
+        return perf_counter() > self._lasting_from
 
     def pattern(self, positions: Indices | BoolArray) -> BoolArray:
         """The pattern, shape (n_moves,), with the moves at these positions."""

@@ -32,7 +32,7 @@ from mampc.program.sample import Indices, Sample
 
 CHUNK = 256  # nodes treated at once; half as many where each has three children
 TOGETHER = 64  # leaves tried at once
-SHARE = 0.1  # of the time limit that one relaxed program may take
+SHARE = 0.5  # of the time limit that one relaxed program may take
 
 
 class PatternTree:
@@ -121,7 +121,8 @@ class _BatchSearch:
         while pending:
             if problem.late:
                 return _least_bound(pending)
-            level, nodes, ids = pending.pop()
+            # Depth first ends soonest; where no end is in sight, best bound first proves most.
+            level, nodes, ids = pending.pop(_best_of(pending) if problem.lasting else -1)
             nodes = nodes.below(problem.cutoff)
             if not len(nodes.bound):
                 continue
@@ -296,6 +297,11 @@ class _BatchSearch:
             return leaves
         self._terms.add(found)
         return appraised(leaves, self._squares, self._terms, [self._terms.latest])
+
+
+def _best_of(pending: list[tuple[int, Nodes, list[int]]]) -> int:
+    """Which of them has the least bound; the deepest of several."""
+    return min(range(len(pending)), key=lambda k: (pending[k][1].bound.min(), -pending[k][0]))
 
 
 def _least_bound(pending: list[tuple[int, Nodes, list[int]]]) -> float:
