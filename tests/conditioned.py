@@ -1,6 +1,6 @@
 """Problems at any conditioning, and their optimum in 60 digits: brute force over patterns, signs and active limits."""
 
-from itertools import combinations, product
+from itertools import product
 from typing import NamedTuple
 
 import mpmath
@@ -183,10 +183,7 @@ class Referee:
             for j, a in enumerate(moves):
                 K[k + i, j] = K[j, k + i] = mpmath.mpf(row.get(a, 0))
             h[k + i] = value
-        try:
-            z = mpmath.lu_solve(K, h)
-        except ZeroDivisionError:
-            return None
+        z = mpmath.lu_solve(K, h)
         d = [z[i] for i in range(k)]
         quadratic = sum(d[i] * self.H[a, b] * d[j] for i, a in enumerate(moves) for j, b in enumerate(moves))
         linear = sum(d[i] * self.H[a, self.n] for i, a in enumerate(moves))
@@ -217,39 +214,51 @@ class Referee:
         return best
 
     def _within(self, moves, bounds, cutoff):
-        """The least cost with a'd <= b for all bounds, by an active set whose multipliers prove it; inf if none."""
-        active, near = [], mpmath.mpf(10) ** -30
-        for _ in range(200):
-            solved = self._solve(moves, [bounds[i] for i in active])
-            if solved is None:  # dependent rows: of two that say the same the tighter one counts
-                active.pop()
-                return self._by_enumeration(moves, bounds)
-            cost, d, multipliers = solved
-            wrong = min(range(len(active)), key=lambda i: multipliers[i], default=None)
-            if wrong is not None and multipliers[wrong] < -near:
-                del active[wrong]
-                continue
+        """The least cost with a'd <= b for all bounds, or one of at least the cutoff; infinite if there is none.
+
+        The dual active-set method of Goldfarb and Idnani: each point is the optimum of a relaxation.
+        """
+        near = mpmath.mpf(10) ** -30
+        active = []
+        while True:
+            cost, d, _ = self._solve(moves, [bounds[i] for i in active])
+            if cost >= cutoff:
+                return cost
             at = dict(zip(moves, d, strict=True))
             excess = [sum(v * at[k] for k, v in row.items()) - b for row, b in bounds]
             worst = max(range(len(bounds)), key=lambda i: excess[i], default=None)
             if worst is None or excess[worst] <= near:
                 return cost
-            if cost >= cutoff and all(mu >= -near for mu in multipliers):  # a relaxation that costs as much
-                return cost
-            if worst in active:
-                break
-            active.append(worst)
-        return self._by_enumeration(moves, bounds)
+            row, left, pulls = bounds[worst][0], excess[worst], None
+            while True:
+                if pulls is None:
+                    pulls = self._solve(moves, [bounds[i] for i in active])[2]
+                step, change = self._direction(moves, [bounds[i][0] for i in active], row)
+                gain = -sum(v * step[k] for k, v in row.items())
+                full = left / gain if gain > near else mpmath.inf
+                ratios = [
+                    -pull / by if by < -near else mpmath.inf for pull, by in zip(pulls, change, strict=True)
+                ]
+                at = min(range(len(ratios)), key=lambda i: ratios[i], default=None)
+                length = full if at is None else min(full, ratios[at])
+                if length == mpmath.inf:
+                    return mpmath.inf
+                pulls = [pull + length * by for pull, by in zip(pulls, change, strict=True)]
+                left -= length * gain
+                if length == full:
+                    active.append(worst)
+                    break
+                del active[at], pulls[at]
 
-    def _by_enumeration(self, moves, bounds):
-        """The same by trying all sets of active bounds."""
-        best, near = mpmath.inf, mpmath.mpf(10) ** -25
-        for count in range(min(len(moves), len(bounds)) + 1):
-            for chosen in combinations(bounds, count):
-                solved = self._solve(moves, list(chosen))
-                if solved is None or solved[0] >= best:
-                    continue
-                at = dict(zip(moves, solved[1], strict=True))
-                if all(sum(v * at[k] for k, v in row.items()) <= b + near for row, b in bounds):
-                    best = solved[0]
-        return best
+    def _direction(self, moves, rows, row):
+        """How moves and multipliers of the active rows change per unit of pull of one more row."""
+        k, e = len(moves), len(rows)
+        K, h = mpmath.zeros(k + e, k + e), mpmath.zeros(k + e, 1)
+        for i, a in enumerate(moves):
+            h[i] = -mpmath.mpf(row.get(a, 0))
+            for j, b in enumerate(moves):
+                K[i, j] = self.H[a, b]
+            for j, other in enumerate(rows):
+                K[k + j, i] = K[i, k + j] = mpmath.mpf(other.get(a, 0))
+        z = mpmath.lu_solve(K, h)
+        return dict(zip(moves, z[:k], strict=True)), list(z[k:])
