@@ -86,6 +86,13 @@ def test_an_ordinary_problem_has_no_warning_and_no_remark(n_p):
     assert not decision.remarks
 
 
+@pytest.mark.parametrize("seed", [537, 1077])
+def test_moves_that_rounding_cannot_tell_apart_do_not_end_a_search(seed):
+    decision = decided(case_of(seed))
+    assert np.isfinite(decision.u).all()
+    assert decision.gap > 0 or decision.status is Status.OPTIMAL
+
+
 def test_moves_that_nothing_determines_are_refused():
     with pytest.raises(mampc.MampcError, match="condition"):
         CondensedQP(unstable(200))

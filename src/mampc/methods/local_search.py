@@ -24,6 +24,7 @@ from mampc.program.condensing import CondensedQP
 from mampc.program.sample import Sample
 
 LEAST_GAIN = 1e-9  # of the cost without moves: smaller gains are not worth another exchange
+LEAST_CURVATURE = 1e-14  # of a move's own: what others leave of it cannot be told from less
 MOST_EXCHANGES = 200
 TAKEN = 1e200  # curvature of a move that is on the pattern already: nothing to gain
 ROUNDS = 3  # of local search, with limits priced in by the multipliers of the last
@@ -48,7 +49,7 @@ class LocalSearch:
             if not gain[best] > 0:
                 return exchanges.pattern
             exchanges.change(added=best)
-            pivot = 1 / np.sqrt(q[best])
+            pivot = 1 / np.sqrt(max(q[best], LEAST_CURVATURE * self._diagonal[best]))
             row = (H[best] - rows[:, best] @ rows) * pivot
             r -= row * (r[best] * pivot)
             q -= row * row
@@ -61,7 +62,10 @@ class LocalSearch:
         for _ in range(MOST_EXCHANGES):
             held = exchanges.held
             rows = H[held]
-            W = np.linalg.inv(rows[:, held])
+            try:
+                W = np.linalg.inv(rows[:, held])
+            except np.linalg.LinAlgError:  # moves that rounding cannot tell apart
+                break
             d, B, w = -(W @ f[held]), W @ rows, np.diag(W)
             r, q = f + d @ rows, self._diagonal - (rows * B).sum(axis=0)
             q[held] = TAKEN
@@ -120,6 +124,7 @@ class LocalSearch:
 
     def _gain(self, r: Array, q: Array) -> Array:
         """What a move gains, given its gradient and curvature, when it has at least its least size."""
+        q = np.maximum(q, LEAST_CURVATURE * self._diagonal)
         if not self.admissible.sized:
             gain: Array = 0.5 * r * r / q
             return gain

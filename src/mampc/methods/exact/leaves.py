@@ -60,7 +60,7 @@ def finished(level: int, nodes: Nodes, squares: Squares, terms: Terms) -> tuple[
     normal = across @ M
     diagonal = np.arange(root.shape[2])
     normal[:, diagonal, diagonal] += 1.0
-    inverse = np.linalg.inv(normal)
+    inverse = inverse_of(normal)
     x = inverse @ (across @ residual)
     residual -= M @ x
     if squares.refined:
@@ -91,13 +91,21 @@ def with_one_more(level: int, nodes: Nodes, rest: Rest, squares: Squares, terms:
     )
 
 
+def inverse_of(normal: Array) -> Array:
+    """Inverses of normal equations, shape (..., k, k); of moves that rounding cannot tell apart, the pseudo-inverse."""
+    try:
+        return np.linalg.inv(normal)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(normal, hermitian=True)
+
+
 def appraised(leaves: Leaves, squares: Squares, terms: Terms, columns: list[int]) -> Leaves:
     """The leaves bounded with these terms."""
     chosen = leaves.chosen
     none, diagonal = chosen < 0, np.arange(chosen.shape[1])
     normal = squares.normal[chosen[:, :, None], chosen[:, None, :]]
     normal[:, diagonal, diagonal] += none
-    inverse = np.linalg.inv(normal)
+    inverse = inverse_of(normal)
     A = squares.L[:, chosen].transpose(1, 0, 2)
     residual = np.repeat(terms.c[None, :, columns], len(chosen), axis=0)
     d = np.zeros((*chosen.shape, len(columns)))
