@@ -249,3 +249,30 @@ def test_arguments_that_do_not_fit_are_refused(options, message):
 def test_a_list_of_plants_needs_one_per_seed():
     with pytest.raises(mampc.MampcError, match="plant: expected one, or one per seed"):
         mampc.simulate_batch([TANK] * 3, regulator(tank_problem()), tank_reference(20), seeds=[0, 1])
+
+
+def bank_regulator(problem, rules, noise):
+    controller = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules)
+    return mampc.Regulator(controller, mampc.LoadBank(problem.model, noise=noise))
+
+
+@pytest.mark.parametrize("name", ["plain", "price", "budget and price"])
+@pytest.mark.parametrize("seed", range(2))
+def test_each_loop_with_a_load_bank_equals_its_single_run(name, seed):
+    model = random_model(seed, n=2 + seed, m=2, l=1 + seed, feedthrough=seed == 1)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=10, control_horizon=3, move_weight=0.05,
+        limits=mampc.Limits(u_min=model.u_op - 1.0, u_max=model.u_op + 1.0),
+    )  # fmt: skip
+    reference = mampc.steps(60, model.y_op, [(5, model.y_op + 1.0), (30, model.y_op - 0.5)])
+    assert_equal_to_single_runs(
+        replace(model, B=1.2 * model.B), bank_regulator(problem, RULES[name], 0.05), reference,
+        noise=0.05, preview=seed == 1, loads=[loads.RandomSteps(size=0.3, every=20.0)],
+    )  # fmt: skip
+
+
+def test_a_load_bank_on_a_nonlinear_plant_with_outputs_doubted_equals_its_single_runs():
+    loop = bank_regulator(tank_problem(), RULES["price"], 0.1)
+    jump = np.zeros((80, 2))
+    jump[40, 0] = 500.0
+    assert_equal_to_single_runs(TANK, loop, tank_reference(80), noise=0.1, output_disturbance=jump)

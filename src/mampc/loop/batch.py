@@ -14,7 +14,8 @@ from mampc.base.names import Names
 from mampc.base.progress import watched
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.loop.batched_plans import BatchedPlans, batched_plans
-from mampc.loop.estimation import Estimate, KalmanFilter
+from mampc.loop.estimation import KalmanFilter
+from mampc.loop.load_bank import LoadBank
 from mampc.loop.loads import Load
 from mampc.loop.metrics import Metrics
 from mampc.loop.motion import Faults, motions_of
@@ -102,9 +103,9 @@ def simulate_batch(
 ) -> Batch:
     """Run one regulator in many closed loops; each comes out as `simulate` with its seed would give it.
 
-    Plain MPC and exact searches by a table, with `KalmanFilter`, are stepped as arrays over all loops, with an ordinary
-    step for each loop in which a limit is active or a measurement is doubted. Every other regulator is simulated loop
-    by loop. Inputs agree with those of `simulate` up to rounding.
+    Plain MPC and exact searches by a table, with `KalmanFilter` or `LoadBank`, are stepped as arrays over all loops,
+    with an ordinary step for each loop in which a limit is active or a measurement is doubted. Every other regulator
+    is simulated loop by loop. Inputs agree with those of `simulate` up to rounding.
 
     Args:
         plant: one for all loops, or a sequence with one for each, such as perturbed models.
@@ -153,10 +154,10 @@ def simulate_batch(
             )
         )  # fmt: skip
     courses = [one.drawn(seed) for one, seed in zip(acting, seeds, strict=True)]
-    everyday = type(regulator) is Regulator and type(regulator.estimator) is KalmanFilter
+    everyday = type(regulator) is Regulator and type(regulator.estimator) in (KalmanFilter, LoadBank)
     plans = None
     if everyday and not as_flag("keep_decisions", keep_decisions):
-        plans = batched_plans(regulator.controller, preview)
+        plans = batched_plans(regulator._planner, preview)
     model, T = regulator.controller.problem.model, len(courses[0])
     records = _Records(courses, model.n_outputs)
     if plans is None:
@@ -256,7 +257,8 @@ class _Loops:
         self._actuators = [state.actuators for _, state in states]
         self._inputs = np.array([state.controller.inputs for _, state in states])
         self._active: list[Array | None] = [None] * len(states)
-        self._estimate = _stacked(Estimate, [state.estimate for _, state in states])
+        estimates = [state.estimate for _, state in states]
+        self._estimate = _stacked(type(estimates[0]), estimates)
         self._sensors = _stacked(SensorState, [state.sensors for _, state in states])
         self._v_last = np.array([state.measured_disturbance for _, state in states])
 
@@ -283,12 +285,12 @@ class _Loops:
         """The inputs after the measurements y (S, l), with the measured disturbances v (S, d)."""
         sensors, last, u = self._regulator._sensors, self._estimate, self._inputs[:, -1]
         told = v if self._has_v else self._v_last
-        estimator = cast(KalmanFilter, self._regulator.estimator)
+        estimator = cast(KalmanFilter | LoadBank, self._regulator.estimator)
         estimate, innovation, _ = estimator.updates(last, u, y, self._v_last, told)
         fine = sensors.are_fine(self._sensors, y, innovation)
         after = sensors.after_fine(self._sensors, y, estimator.loads_of(last))
         ahead = self._reference[k : k + (self._n_p or 0) + 1].swapaxes(0, 1).reshape(len(y), -1)
-        place = self._regulator.controller.condensed.parameter
+        place = self._regulator._planner.condensed.parameter
         parameters = np.ones((len(y), place.one.stop + ahead.shape[1]))
         parameters[:, place.x], parameters[:, place.u_previous] = estimate.x, u
         parameters[:, place.u_deviation] = u
@@ -319,7 +321,7 @@ class _Loops:
         sensors: dict[str, Any] = {name: part[s].copy() for name, part in vars(self._sensors).items()}
         return RegulatorState(
             ControllerState(self._inputs[s].copy(), k, None, self._active[s]),
-            Estimate(*(part[s].copy() for part in vars(self._estimate).values())),
+            type(self._estimate)(**{name: part[s].copy() for name, part in vars(self._estimate).items()}),
             self._v_last[s].copy(),
             SensorState(**sensors | {"blind": int(sensors["blind"])}),
             self._actuators[s],

@@ -174,7 +174,9 @@ class LoadBank(Estimator):
     def loads_of(self, estimate: Estimate) -> Array:
         """The loads of the mixture, shape (k,), in sizes that show in the outputs like their noise."""
         bank, n = _bank(estimate), self.model.n_states
-        loads: Array = (bank.weights @ bank.members)[n : n + self.loads.count]
+        loads: Array = np.einsum(
+            "...b,...bz->...z", bank.weights, bank.members[..., n : n + self.loads.count]
+        )
         return loads
 
     def with_loads(self, estimate: Estimate, stuck: BoolArray, loads: Array) -> Estimate:
@@ -226,6 +228,21 @@ class LoadBank(Estimator):
         seen = c.dot(each[:, n_z:-l])  # innovation and movement of the mixture
         estimate = self._weighed(each[:, :n_z], c, bank.usual, each[:, -l:], self.filters(self._all))
         return Updated(estimate, seen[:l], seen[l:])
+
+    def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
+        """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
+        bank = _bank(last)
+        known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1))), axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            c, mixed = self._mixed(bank)
+            n_z, l, hypotheses = mixed.shape[2], y.shape[1], len(self.members)
+            each = np.matmul(self._of_states, mixed[..., None])[..., 0]
+            each += (known @ self._of_known.T).reshape(len(y), hypotheses, -1)
+            seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:-l])
+            estimate = self._weighed(
+                each[:, :, :n_z], c, bank.usual, each[:, :, -l:], self.filters(self._all)
+            )
+        return Updated(estimate, seen[:, :l], seen[:, l:])
 
     def _everyday(self) -> tuple[Array, Array]:
         """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1) to all that `update` needs.
@@ -290,27 +307,29 @@ class LoadBank(Estimator):
         return filters
 
     def _mixed(self, bank: BankEstimate) -> tuple[Array, Array]:
-        """How likely each hypothesis is now, before the measurement, shape (B,); and where its filter starts."""
-        weights = bank.weights
-        joint = weights[:, None] * (self._chances + self._returns[:, None] * bank.usual)
-        c = np.maximum(self._ones.dot(joint), IMPOSSIBLE)
-        return c, joint.T.dot(bank.members) / c[:, None]
+        """How likely each hypothesis is now, before the measurement, (..., B); and where its filter starts."""
+        joint = bank.weights[..., None] * (self._chances + self._returns[:, None] * bank.usual[..., None, :])
+        c = np.maximum(self._ones @ joint, IMPOSSIBLE)
+        return c, np.matmul(joint.swapaxes(-1, -2), bank.members) / c[..., None]
 
     def _weighed(
         self, members: Array, c: Array, usual: Array, white: Array, filters: Filters
     ) -> BankEstimate:
-        """The estimate after Bayes' rule, from the innovations made white, shape (B, l)."""
-        likelihood = filters.log_scale - 0.5 * np.einsum("bi,bi->b", white, white)
-        weights = c * np.exp(likelihood - likelihood[likelihood.argmax()])
-        weights /= weights.dot(self._ones)
+        """The estimate after Bayes' rule, from the innovations made white, shape (..., B, l)."""
+        likelihood = filters.log_scale - 0.5 * np.einsum("...bi,...bi->...b", white, white)
+        weights = c * np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
+        weights /= weights.dot(self._ones)[..., None]
         usual = np.maximum((1 - FORGETS) * usual + FORGETS * weights, LEAST) * self._lasts
-        usual /= usual.dot(self._ones)
+        usual /= usual.dot(self._ones)[..., None]
         return self._estimate(members, weights, usual)
 
     def _estimate(self, members: Array, weights: Array, usual: Array) -> BankEstimate:
-        plan = (weights[:, None] * members).ravel().dot(self._mixture)
+        shape = (*weights.shape[:-1], -1)
+        plan = (weights[..., None] * members).reshape(shape).dot(self._mixture)
         l, m = self.model.n_outputs, self.model.n_inputs
-        return BankEstimate(plan[: -m - l], plan[-l:], plan[-m - l : -l], members, weights, usual)
+        return BankEstimate(
+            plan[..., : -m - l], plan[..., -l:], plan[..., -m - l : -l], members, weights, usual
+        )
 
     def _seen(self, members: Array) -> Array:
         """The outputs of every hypothesis beside those of the inputs, shape (B, l)."""
