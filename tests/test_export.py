@@ -195,6 +195,20 @@ def test_the_doubled_hour_in_autumn(tmp_path, options, newest_first):
     assert bool(options) or told(export, "the clock goes back an hour", "end of summer time")
 
 
+@pytest.mark.parametrize("twice", [3, 4])
+def test_an_hourly_row_that_stands_twice_on_a_sunday_night_is_not_the_doubled_hour(tmp_path, twice):
+    lines = rows(stamps(dt=3600.0, start="2024-04-13 22:00:00"))
+    export = read(tmp_path, text(lines[: twice + 1] + lines[twice:]))
+    assert_whole(export, 3600.0)
+    assert told(export, f"times stand more than once in row {twice + 3}")
+
+
+def test_the_doubled_hour_of_hourly_rows(tmp_path):
+    times = pd.date_range("2024-10-26 22:00", periods=len(U), freq="h", tz="Europe/Berlin")
+    export = read(tmp_path, text(rows(times.strftime("%d.%m.%Y %H:%M").tolist())))
+    assert_whole(export, 3600.0)
+
+
 def test_the_missing_hour_in_spring_is_a_gap_unless_the_zone_is_known(tmp_path):
     content = text(rows(local(len(U), start="2024-03-31 01:00:00")))
     assert len(read(tmp_path, content).records) == 2

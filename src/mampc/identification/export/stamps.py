@@ -240,12 +240,20 @@ def _clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Finding
         moment = origin + pd.Timedelta(seconds=float(seconds[known[i]]))
         if usual >= HOUR and not (moment.weekday() == 6 and moment.hour <= 3):
             continue
+        if usual >= HOUR and _same_cells(sheet, int(known[i]), int(known[i + 1])):
+            continue  # one row that stands twice
         corrected[known[i + 1 :]] += HOUR
         findings.change(
             f"the clock goes back an hour after {moment} (row {sheet.numbers[known[i + 1]]}): taken as the end of "
             "summer time, rows kept in their order"
         )
     return corrected
+
+
+def _same_cells(sheet: Sheet, one: int, other: int) -> bool:
+    """Whether two rows hold the same cells, that of the time included."""
+    columns = range(len(sheet.header))
+    return all(cells[one] == cells[other] for cells in (list(sheet.column(at)) for at in columns))
 
 
 def _unevenness(seconds: Array) -> float:
