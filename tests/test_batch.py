@@ -115,6 +115,23 @@ def test_what_cannot_be_batched_is_simulated_one_by_one(loop):
     assert_equal_to_single_runs(TANK, loop, tank_reference(12), noise=0.1, seeds=(3, 4))
 
 
+def test_each_loop_may_have_its_own_regulator():
+    problem = tank_problem()
+    bank = mampc.Regulator(mampc.MPC(problem), mampc.LoadBank(problem.model, noise=0.1))
+    rule = mampc.Regulator(mampc.rivals.DeadBand(mampc.MPC(problem), size=1.0))
+    price = regulator(problem, RULES["price"])
+    own = [price, bank, rule]
+    batch = mampc.simulate_batch(
+        TANK, own, tank_reference(40), seeds=(0, 3, 3), noise=0.1, keep_decisions=True
+    )
+    for s, (loop, seed) in enumerate(zip(own, (0, 3, 3), strict=True)):
+        run = mampc.simulate(TANK, loop, tank_reference(40), seed=seed, noise=0.1)
+        np.testing.assert_allclose(batch.u[s], run.u, atol=1e-9, rtol=0)
+        assert [d.status for d in batch.decisions[s]] == [d.status for d in run.decisions]
+    with pytest.raises(mampc.MampcError, match="one per seed"):
+        mampc.simulate_batch(TANK, own, tank_reference(4), seeds=range(2))
+
+
 def test_a_plant_with_measured_disturbances_and_faults():
     plant = mampc.plants.SolidOxideFuelCell()
     model = mampc.linearise(plant).discretise(0.5)

@@ -331,3 +331,19 @@ def test_one_input_acts_where_it_reaches_furthest(pole, sample):
 def test_a_target_out_of_reach_is_refused():
     with pytest.raises(mampc.MampcError, match="reached in 3 samples"):
         mampc.rivals.hands_off(double_integrator(), [100.0, 0.0], steps=3, limits=UNIT)
+
+
+def test_a_steady_target_is_reached_whatever_the_states_units_are():
+    model = mampc.plants.ogunnaike_ray()  # dead times, and states some thousand times apart
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=40, control_horizon=5, output_weight=1 / np.array([1e-3, 1e-3, 0.1]) ** 2,
+        move_weight=1.0, limits=mampc.Limits(u_min=0.0, u_max=2 * model.u_op),
+    )  # fmt: skip
+    controller = mampc.rivals.Penalised(problem, penalty=mampc.rivals.L1(weight=1.0), on="inputs")
+    reference = model.y_op + np.array([0.01, 0.01, 1.0])
+    place = controller.condensed.parameter
+    parameter = place.vector(np.zeros(model.n_states), model.u_op, reference)
+    target = mampc.program.steady.SteadyTarget(problem, place).at(parameter)
+    np.testing.assert_allclose(target.y, reference, rtol=1e-6)
+    u = target.u - model.u_op
+    np.testing.assert_allclose(model.A @ target.x + model.B[:, :3] @ u, target.x, atol=1e-8)

@@ -19,10 +19,11 @@ from mampc.loop.load_bank import LoadBank
 from mampc.loop.loads import Load
 from mampc.loop.metrics import Metrics
 from mampc.loop.motion import Faults, motions_of
+from mampc.loop.one_by_one import Moment, closed_loops
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.sensors import SensorState
-from mampc.loop.simulation import Acting, Course, acting_on, at_rest, closed_loop
+from mampc.loop.simulation import Acting, Course, acting_on, at_rest
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.plants import Plant
@@ -85,7 +86,7 @@ class Batch:
 
 def simulate_batch(
     plant: Plant | StateSpace | Sequence[Plant | StateSpace],
-    regulator: Regulator,
+    regulator: Regulator | Sequence[Regulator],
     reference: Any,
     *,
     seeds: Iterable[int],
@@ -105,15 +106,16 @@ def simulate_batch(
 
     Plain MPC and exact searches by a table, with `KalmanFilter` or `LoadBank`, are stepped as arrays over all loops,
     with an ordinary step for each loop in which a limit is active or a measurement is doubted. Every other regulator
-    is simulated loop by loop. Inputs agree with those of `simulate` up to rounding.
+    is stepped loop by loop, and only the plants move as one. Inputs agree with those of `simulate` up to rounding.
 
     Args:
         plant: one for all loops, or a sequence with one for each, such as perturbed models.
-        regulator, reference, steps, noise, preview, u_initial: as in `simulate`.
+        regulator: one for all loops, or a sequence with one for each, such as values of a setting.
+        reference, steps, noise, preview, u_initial: as in `simulate`.
         seeds: of noise and loads, one per loop; they give the number S of loops.
         input_disturbance, output_disturbance, measured_disturbance: as in `simulate`.
         loads, valves: as in `simulate`; loads are drawn for each loop with its seed.
-        keep_decisions: keep every `Decision`; then loops are simulated one by one, and memory grows with them.
+        keep_decisions: keep every `Decision`; then regulators are stepped loop by loop, and memory grows with them.
         progress: as in `simulate`.
 
     The reference and the disturbances may also have one course per loop, shape (S, T, signals).
@@ -131,6 +133,11 @@ def simulate_batch(
         raise MampcError(
             f"plant: expected one, or one per seed, {len(seeds)} of them, received {len(plants)}"
         )
+    regulators = list(regulator) if isinstance(regulator, Sequence) else [regulator] * len(seeds)
+    if len(regulators) != len(seeds):
+        raise MampcError(
+            f"regulator: expected one, or one per seed, {len(seeds)} of them, received {len(regulators)}"
+        )
     own = {
         "reference": reference, "input_disturbance": input_disturbance,
         "output_disturbance": output_disturbance, "measured_disturbance": measured_disturbance,
@@ -143,48 +150,49 @@ def simulate_batch(
             )
     acting: list[Acting] = []
     for s in range(len(seeds)):
-        if s and plants[s] is plants[0] and not each:
-            acting.append(acting[0])
+        if s and plants[s] is plants[s - 1] and regulators[s] is regulators[s - 1] and not each:
+            acting.append(acting[-1])
             continue
         one = {name: value[s] if name in each else value for name, value in own.items()}
         acting.append(
             acting_on(
-                plants[s], regulator, steps=steps, noise=noise, loads=loads, valves=valves, u_initial=u_initial,
+                plants[s], regulators[s], steps=steps, noise=noise, loads=loads, valves=valves, u_initial=u_initial,
                 **one,
             )
         )  # fmt: skip
     courses = [one.drawn(seed) for one, seed in zip(acting, seeds, strict=True)]
-    everyday = type(regulator) is Regulator and type(regulator.estimator) in (KalmanFilter, LoadBank)
-    plans = None
-    if everyday and not as_flag("keep_decisions", keep_decisions):
-        plans = batched_plans(regulator._planner, preview)
-    model, T = regulator.controller.problem.model, len(courses[0])
+    keep = as_flag("keep_decisions", keep_decisions)
+    first, plans = regulators[0], None
+    everyday = type(first) is Regulator and type(first.estimator) in (KalmanFilter, LoadBank)
+    if everyday and not keep and all(one is first for one in regulators):
+        plans = batched_plans(first._planner, preview)
+    model, T = first.controller.problem.model, len(courses[0])
+    if any(own.controller.problem.model.dt != model.dt for own in regulators):
+        raise MampcError("regulator: expected the same sample time in all, received several")
     records = _Records(courses, model.n_outputs)
-    if plans is None:
-        for s in watched(len(seeds), progress):
-            run = closed_loop(plants[s], regulator, courses[s], preview=preview, progress=False)
-            records.take(s, run, keep_decisions)
-    else:
-        parts = [range(s, min(s + TOGETHER, len(seeds))) for s in range(0, len(seeds), TOGETHER)]
-        bar = iter(watched(T * len(parts), progress))
-        for part in parts:
-            loops = _Loops(
-                plants[part.start : part.stop],
-                regulator,
-                courses[part.start : part.stop],
-                plans,
-                preview,
-                valves,
+    parts = [range(s, min(s + TOGETHER, len(seeds))) for s in range(0, len(seeds), TOGETHER)]
+    bar = iter(watched(T * len(parts), progress))
+    for part in parts:
+        rows = slice(part.start, part.stop)
+        if plans is None:
+            moments = closed_loops(
+                plants[rows], regulators[rows], courses[rows], preview=preview, samples=range(T)
             )
-            for k in range(T):
+            for k, moment in enumerate(moments):
                 next(bar)
-                loops.step(k, records, part)
-        next(bar, None)
+                records.take(k, part, moment, keep)
+            continue
+        loops = _Loops(plants[rows], first, courses[rows], plans, preview, valves)
+        for k in range(T):
+            next(bar)
+            loops.step(k, records, part)
+    next(bar, None)
     return Batch(
         t=np.arange(T) * model.dt, u=records.u, y=records.y, y_measured=records.y_measured,
         r=np.array([course.reference[:T] for course in courses]), u_initial=records.u_initial,
         v=np.array([course.v for course in courses]), position=records.position, seeds=seeds,
-        faults=tuple(records.faults), decisions=tuple(records.decisions), dt=model.dt, names=plants[0].names,
+        faults=tuple(records.faults), decisions=tuple(map(tuple, records.decisions)), dt=model.dt,
+        names=plants[0].names,
     )  # fmt: skip
 
 
@@ -208,18 +216,18 @@ class _Records:
         self.u, self.position = np.empty((S, T, m)), np.empty((S, T, m))
         self.y, self.y_measured = np.empty((S, T, l)), np.empty((S, T, l))
         self.faults: list[dict[int, Faults]] = [{} for _ in courses]
-        self.decisions: list[tuple[Decision, ...]] = [() for _ in courses]
+        self.decisions: list[list[Decision]] = [[] for _ in courses]
 
-    def take(self, s: int, run: Run, decisions: bool) -> None:
-        self.u[s], self.position[s], self.y[s], self.y_measured[s] = (
-            run.u,
-            run.position,
-            run.y,
-            run.y_measured,
-        )
-        self.faults[s] = run.faults
+    def take(self, k: int, part: range, moment: Moment, decisions: bool) -> None:
+        """Sample k of the loops of a part."""
+        rows = slice(part.start, part.stop)
+        self.u[rows, k], self.position[rows, k] = moment.u, moment.position
+        self.y[rows, k], self.y_measured[rows, k] = moment.y, moment.y_measured
+        for s, wrong in moment.faults.items():
+            self.faults[part.start + s][k] = wrong
         if decisions:
-            self.decisions[s] = run.decisions
+            for s, decision in zip(part, moment.decisions, strict=True):
+                self.decisions[s].append(decision)
 
 
 class _Loops:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import matrix_balance, null_space
 
 from mampc.base.checks import Array
 from mampc.program.daqp import DaqpSolver
@@ -46,11 +46,16 @@ class SteadyTarget:
         root = square_root(problem.output_weight)
         gain = np.abs(root @ response).max(axis=(0, 1))
         self._unit = 1 / np.where(gain > 0, gain, 1.0)
+        # States in units that make the model's numbers alike, so that a small singular value is an integrator.
+        _, (size, _) = matrix_balance(model.A, permute=False, separate=True)
+        dynamics = np.hstack([(np.eye(n) - model.A) * size, -B * self._unit])
+        self._row = np.maximum(np.linalg.norm(dynamics, axis=1), np.finfo(float).tiny)
+        dynamics /= self._row[:, None]
         # Everything steady is a particular solution plus a combination of these columns.
-        dynamics = np.hstack([np.eye(n) - model.A, -B * self._unit])
         self._steady = null_space(dynamics, rcond=INTEGRATES)
         self._particular = np.linalg.pinv(dynamics, rcond=INTEGRATES)
-        self._outputs = root @ np.hstack([model.C, D * self._unit])
+        self._outputs = root @ np.hstack([model.C * size, D * self._unit])
+        self._size = size
         self._root = root
         to_u = self._steady[n:]
         weighted = self._outputs @ self._steady
@@ -68,7 +73,7 @@ class SteadyTarget:
         reference = p[-l:]  # from the operating point, as v is
         forcing = model.B @ np.concatenate([d_u, v])
         feed = model.D @ np.concatenate([d_u, v])
-        particular = self._particular @ forcing
+        particular = self._particular @ (forcing / self._row)
         missing = self._root @ (reference - p[at.output_disturbance] - feed)
         missing = missing - self._outputs @ particular
         f = -2 * self._weighted.T @ missing + 2 * NEAREST * self._to_u.T @ particular[n:]
@@ -79,7 +84,7 @@ class SteadyTarget:
         solution = self._solver.solve(f, low, high)
         z = np.zeros(len(f)) if solution.z is None else solution.z
         both = particular + self._steady @ z
-        x, u = both[:n], model.u_op + self._unit * both[n:]
+        x, u = self._size * both[:n], model.u_op + self._unit * both[n:]
         u = np.clip(u, limits.u_min, limits.u_max)
         y = (
             model.y_op
