@@ -37,6 +37,7 @@ class Loop:
     estimator: mampc.KalmanFilter | mampc.LoadBank
     sensors: mampc.SensorChecks
     max_blind_steps: int
+    reference_filter: mampc.ReferenceFilter | None = None
 
     @property
     def exactly_sparse(self):
@@ -49,8 +50,9 @@ class Loop:
         else:
             controller = mampc.MAMPC(self.problem, self.rules, method=self.method, **self.settings)
         return mampc.Regulator(
-            controller, self.estimator, sensors=self.sensors, max_blind_steps=self.max_blind_steps
-        )
+            controller, self.estimator, sensors=self.sensors, max_blind_steps=self.max_blind_steps,
+            reference_filter=self.reference_filter,
+        )  # fmt: skip
 
 
 @st.composite
@@ -146,7 +148,10 @@ def loops(draw):
         largest_jump=draw(st.sampled_from([None, None, np.inf, scale, 0.1 * scale])),
         confirm=draw(st.integers(1, 4)), stuck_after=draw(st.sampled_from([None, 2, 4])),
     )  # fmt: skip
-    return Loop(problem, rules, method, settings, estimator, sensors, draw(st.sampled_from([0, 0, 2, 5])))
+    smooth = draw(st.sampled_from([None, None, {"time_constant": 3.0}, {"rate": scale}]))
+    smooth = None if smooth is None else mampc.ReferenceFilter(**smooth)
+    blind = draw(st.sampled_from([0, 0, 2, 5]))
+    return Loop(problem, rules, method, settings, estimator, sensors, blind, smooth)
 
 
 # Faults. Each is drawn for as many signals as there can be, and cut to those that there are.

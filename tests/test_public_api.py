@@ -45,6 +45,9 @@ def calls(v):
     yield "MAMPC method", lambda: mampc.MAMPC(PROBLEM, mampc.MoveRules(price=1.0), method=v)
     yield "Regulator", lambda: mampc.Regulator(v)
     yield "Regulator estimator", lambda: mampc.Regulator(MPC, v)
+    yield "Regulator filter", lambda: mampc.Regulator(MPC, reference_filter=v)
+    for k in ("time_constant", "rate"):
+        yield f"ReferenceFilter {k}", lambda k=k: mampc.ReferenceFilter(**{k: v})
     yield "n4sid", lambda: mampc.n4sid(v)
     yield "n4sid order", lambda: mampc.n4sid(DATA, order=v)
     yield "n4sid records", lambda: mampc.n4sid([DATA, v])

@@ -17,6 +17,7 @@ from mampc.loop.estimation import KalmanFilter
 from mampc.loop.hypotheses import Hypothesis
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.metrics import Metrics
+from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.regulator import Regulator
 from mampc.loop.replay import Difference, Recording, replay
 from mampc.loop.run import Run
@@ -77,6 +78,7 @@ __all__ = [
     "Noise",
     "PenaltyDecomposition",
     "Recording",
+    "ReferenceFilter",
     "Regulator",
     "RegulatorState",
     "Remark",

@@ -165,7 +165,7 @@ def simulate_batch(
     first, plans = regulators[0], None
     everyday = type(first) is Regulator and type(first.estimator) in (KalmanFilter, LoadBank)
     if everyday and not keep and all(one is first for one in regulators):
-        plans = batched_plans(first._planner, preview)
+        plans = batched_plans(first._planner, preview or first.reference_filter is not None)
     model, T = first.controller.problem.model, len(courses[0])
     if any(own.controller.problem.model.dt != model.dt for own in regulators):
         raise MampcError("regulator: expected the same sample time in all, received several")
@@ -269,6 +269,9 @@ class _Loops:
         self._estimate = _stacked(type(estimates[0]), estimates)
         self._sensors = _stacked(SensorState, [state.sensors for _, state in states])
         self._v_last = np.array([state.measured_disturbance for _, state in states])
+        self._filter, self._tracked = regulator._filter, None
+        if self._filter is not None:
+            self._tracked = np.array([state.reference for _, state in states])
 
     def step(self, k: int, records: _Records, part: range) -> None:
         """Sample k of all loops."""
@@ -297,7 +300,11 @@ class _Loops:
         estimate, innovation, _ = estimator.updates(last, u, y, self._v_last, told)
         fine = sensors.are_fine(self._sensors, y, innovation)
         after = sensors.after_fine(self._sensors, y, estimator.loads_of(last))
-        ahead = self._reference[k : k + (self._n_p or 0) + 1].swapaxes(0, 1).reshape(len(y), -1)
+        asked = self._reference[k : k + self._n_p + 1].swapaxes(0, 1) if self._n_p else self._reference[k]
+        tracked, ahead = self._tracked, asked.reshape(len(y), -1)
+        if self._filter is not None and tracked is not None:
+            course = self._filter.course(tracked, asked, self._regulator._samples)
+            tracked, ahead = course[:, 0], course.reshape(len(y), -1)
         place = self._regulator._planner.condensed.parameter
         parameters = np.ones((len(y), place.one.stop + ahead.shape[1]))
         parameters[:, place.x], parameters[:, place.u_previous] = estimate.x, u
@@ -312,6 +319,7 @@ class _Loops:
         decided &= fine & usable
         one_by_one = np.flatnonzero(~decided).tolist()
         before = [self._state(s, k) for s in one_by_one]
+        self._tracked = tracked
         self._inputs = np.concatenate([self._inputs[:, 1:], first[:, None]], axis=1)
         everywhere = {"blind": np.zeros(len(y), dtype=int)}
         self._estimate, self._sensors, self._v_last = estimate, SensorState(**vars(after) | everywhere), told
@@ -321,7 +329,7 @@ class _Loops:
         for loop in np.flatnonzero(decided) if any(active is not None for active in self._active) else ():
             self._active[loop] = None
         for s, state in zip(one_by_one, before, strict=True):
-            self._step_one(s, state, y[s], ahead[s].reshape(-1, y.shape[1]), told[s])
+            self._step_one(s, state, y[s], asked[s], told[s])
         return self._inputs[:, -1]
 
     def _state(self, s: int, k: int) -> RegulatorState:
@@ -333,18 +341,21 @@ class _Loops:
             self._v_last[s].copy(),
             SensorState(**sensors | {"blind": int(sensors["blind"])}),
             self._actuators[s],
+            None if self._tracked is None else self._tracked[s].copy(),
         )
 
-    def _step_one(self, s: int, state: RegulatorState, y: Array, ahead: Array, v: Array) -> None:
+    def _step_one(self, s: int, state: RegulatorState, y: Array, asked: Array, v: Array) -> None:
         """An ordinary step of one loop."""
         told: dict[str, Any] = {"measured_disturbance": v} if self._has_v else {}
-        decision = self._regulator.step(state, y, ahead if self._n_p else ahead[0], **told)
+        decision = self._regulator.step(state, y, asked, **told)
         state = decision.state
         self._inputs[s], self._active[s] = state.controller.inputs, state.controller.active
         for stack, own in ((self._estimate, state.estimate), (self._sensors, state.sensors)):
             for name, value in vars(own).items():
                 getattr(stack, name)[s] = value
         self._v_last[s] = state.measured_disturbance
+        if self._tracked is not None:
+            self._tracked[s] = state.reference
 
 
 def _copied(stack: Any) -> Any:

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import LARGEST, Array, as_shaped, as_vector, as_whole
+from mampc.base.checks import LARGEST, Array, as_read, as_shaped, as_vector, as_whole, is_usable
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.loop.actuators import LATEST, Actuators
 from mampc.loop.estimation import Estimate, Estimator, KalmanFilter
+from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.sensors import Judged, SensorChecks, SensorState
 from mampc.loop.state import RegulatorState
 from mampc.program.daqp import active_flags
@@ -32,6 +33,8 @@ class Regulator:
         applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
             position feedback are never exact. In input units, a scalar or (m,); default a hundredth of the
             input's range, or 1e-6 where that is not finite.
+        reference_filter: lags and ramps between the references given and those tracked; default none. They start
+            from the outputs, also when the last input comes back from manual.
 
     Raises:
         MampcError: arguments of other types, or an estimator of a model of other dimensions.
@@ -45,6 +48,7 @@ class Regulator:
         sensors: SensorChecks | None = None,
         max_blind_steps: int = 0,
         applied_tolerance: Any = None,
+        reference_filter: ReferenceFilter | None = None,
     ) -> None:
         if not isinstance(controller, Controller):
             raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
@@ -54,6 +58,10 @@ class Regulator:
             )
         if not isinstance(sensors, SensorChecks | None):
             raise MampcError(f"sensors: expected SensorChecks, received {type(sensors).__name__}")
+        if not isinstance(reference_filter, ReferenceFilter | None):
+            raise MampcError(
+                f"reference_filter: expected a ReferenceFilter, received {type(reference_filter).__name__}"
+            )
         model = controller.problem.model
         self.controller = controller
         self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
@@ -70,6 +78,10 @@ class Regulator:
         expected, received = _sizes(model), _sizes(self.estimator.model)
         if received != expected:
             raise MampcError(f"estimator: expected a model with {expected}, received {received}")
+        self.reference_filter, self._filter = reference_filter, None
+        if reference_filter is not None:
+            self._filter = reference_filter.fitted(model.n_outputs, model.dt)
+        self._samples = controller.problem.prediction_horizon + 1
         # What plans predict with may have more states than the plant.
         self._planner = controller
         if self.estimator.planning_model is not self.estimator.model:
@@ -92,14 +104,17 @@ class Regulator:
         Raises:
             MampcError: arrays of the wrong shape, or numbers that are not finite.
         """
-        controller = self.controller.initial_state(u_previous)
+        controller, l = self.controller.initial_state(u_previous), self._y_shape[0]
         v = self.controller.problem.model.v_op
         if measured_disturbance is not None:
             v = as_vector("measured_disturbance", measured_disturbance, len(v))
         estimate = self.estimator.initial(controller.inputs[-1], y, v)
         actuators = self._actuators.initial(controller.inputs)
         sensors = self._sensors.initial(self.estimator.loads_of(estimate))
-        return RegulatorState(controller, estimate, v, sensors, actuators)
+        tracked = None
+        if self._filter is not None:
+            tracked = self._outputs(estimate, controller.inputs[-1], v) if y is None else as_vector("y", y, l)
+        return RegulatorState(controller, estimate, v, sensors, actuators, tracked)
 
     def state_from_json(self, text: str) -> RegulatorState:
         """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
@@ -151,7 +166,8 @@ class Regulator:
             y: measured outputs, shape (l,). Those not believed (not-a-number, masked, or refused by the sensor
                 checks) do not correct the estimate; `decision.ignored_outputs` names them. With none left the
                 inputs are held (see `max_blind_steps`).
-            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
+            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead; where there is a
+                reference filter, what it leads to.
             u_applied: what the plant really got since the last step, shape (m,), if not what was decided:
                 a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided, and so do
                 a value within `applied_tolerance` and one a hundred times further outside its limits than these
@@ -182,6 +198,14 @@ class Regulator:
         if measured_disturbance is not None:
             v = _where_usable(as_shaped("measured_disturbance", measured_disturbance, self._v_shape), v_last)
         estimate, judged, sensors = self._estimate(state, u_previous, y, v)
+        tracked = state.reference
+        if (tracked is None) is not (self._filter is None):
+            kind = "without a" if self._filter is None else "with a"
+            raise MampcError(
+                f"state: expected one of a regulator {kind} reference filter, received another's"
+            )
+        if tracked is not None:
+            reference, tracked = self._filtered(tracked, reference, estimate, u_previous, v, manual)
         blind = sensors.blind > self.max_blind_steps
         decision = self._planner.step(
             memory,
@@ -194,11 +218,32 @@ class Regulator:
             manual=manual,
         )
         return decision._replace(
-            state=RegulatorState(decision.state, estimate, v, sensors, actuators.decided(decision.u)),
+            state=RegulatorState(
+                decision.state, estimate, v, sensors, actuators.decided(decision.u), tracked
+            ),
             ignored_outputs=judged.faults,
             load=self.estimator.load(estimate),
             solve_time=perf_counter() - start,
         )
+
+    def _filtered(
+        self, last: Array, reference: Any, estimate: Estimate, u: Array, v: Array, manual: Any
+    ) -> tuple[Array, Array]:
+        """What is tracked over the horizon, shape (np + 1, l), and now, shape (l,)."""
+        assert self._filter is not None
+        asked = as_read("reference", reference)
+        asked = as_shaped("reference", asked, ((self._samples,) if asked.ndim == 2 else ()) + self._y_shape)
+        in_manual = self.controller.manual_inputs(manual)
+        if in_manual is not None and in_manual.all():
+            last = _where_usable(self._outputs(estimate, u, v), last)
+        if not is_usable(asked.ravel()):
+            return asked, last
+        course = self._filter.course(last, asked, self._samples)
+        return course, course[0]
+
+    def _outputs(self, estimate: Estimate, u: Array, v: Array) -> Array:
+        """The outputs estimated, shape (l,)."""
+        return -self.estimator.innovation(estimate, u, np.zeros(self._y_shape), v)
 
     def _estimate(
         self, state: RegulatorState, u: Array, y: Array, v: Array

@@ -29,6 +29,7 @@ class RegulatorState:
         measured_disturbance: as last reported, shape (d,).
         sensors: what the sensor checks remember.
         actuators: what is remembered of the actuators.
+        reference: tracked last, shape (l,), where a reference filter leads to the ones given; else None.
     """
 
     controller: ControllerState
@@ -36,6 +37,7 @@ class RegulatorState:
     measured_disturbance: Array
     sensors: SensorState
     actuators: ActuatorState
+    reference: Array | None = None
 
     def to_json(self) -> str:
         """The state as JSON text; `Regulator.state_from_json` gives the same numbers back."""
@@ -78,7 +80,7 @@ class RegulatorState:
             f"{part}.{name}": value for part, held in parts.items() for name, value in vars(held).items()
         }
         places |= {f"controller.{name}": value for name, value in self.controller._asdict().items()}
-        places["measured_disturbance"] = self.measured_disturbance
+        places["measured_disturbance"], places["reference"] = self.measured_disturbance, self.reference
         return {place: None if value is None else np.shape(value) for place, value in places.items()}
 
 

@@ -141,7 +141,12 @@ def prepare(
 
 def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
     """The regulator that a study's tables describe."""
-    return Regulator(_controller(_problem(study, model), table), _estimator(study, model), **_sensors(study))
+    controller, estimator = _controller(_problem(study, model), table), _estimator(study, model)
+    smooth = None if table.reference_filter is None else table.reference_filter.made()
+    try:
+        return Regulator(controller, estimator, reference_filter=smooth, **_sensors(study))
+    except MampcError as error:
+        raise StudyError(f"controllers, {table.name!r}, reference_filter: {error}") from None
 
 
 def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator) -> Run:

@@ -22,6 +22,7 @@ from mampc.base.checks import LARGEST
 from mampc.base.errors import MampcError
 from mampc.loop import loads
 from mampc.loop.loads import Load
+from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.valves import Valves
 from mampc.methods.registry import METHODS, method_of
 from mampc.moves.rules import MoveRules
@@ -55,6 +56,17 @@ def _time(value: Any) -> Any:
         raise ValueError(f"a time such as 10.0 or '10 s' (units {', '.join(_SECONDS)})") from None
 
 
+def _rate(value: Any) -> Any:
+    """A number per second, or text with a unit of time, such as "0.5/min"."""
+    number, slash, unit = str(value).partition("/")
+    if not isinstance(value, str) or not slash:
+        return value
+    try:
+        return float(number) / _SECONDS[unit.strip()]
+    except (KeyError, ValueError):
+        raise ValueError(f"a rate such as 0.01 or '0.5/min' (units {', '.join(_SECONDS)})") from None
+
+
 def file_word(name: str) -> str:
     """A name as it stands in file names."""
     return re.sub(r"[\W_]+", "-", name.lower()).strip("-")
@@ -70,6 +82,8 @@ Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 Time = Annotated[float, BeforeValidator(_time), Field(gt=0, allow_inf_nan=False)]
+Lag = Annotated[float, BeforeValidator(_time), Field(ge=0, allow_inf_nan=False)]
+Rate = Annotated[float, BeforeValidator(_rate), Field(gt=0, allow_inf_nan=False)]
 Values = Number | list[Number]
 Weight = Number | list[Number] | list[list[Number]]
 Word = Annotated[str, Field(min_length=1, max_length=80)]
@@ -157,7 +171,7 @@ class LoadTable(Table):
     at: Literal["input", "output", "measured"] | None = None
     size: Values | None = None
     sizes: list[Values] | None = None
-    times: list[Annotated[float, BeforeValidator(_time), Field(ge=0, allow_inf_nan=False)]] | None = None
+    times: list[Lag] | None = None
     every: Time | None = None
     time_constant: Time | None = None
     period: Time | None = None
@@ -238,6 +252,16 @@ class ActuatorsTable(Table):
     million_starts: Positive | list[Positive] | None = None
 
 
+class ReferenceFilterTable(Table):
+    """As `mampc.ReferenceFilter`."""
+
+    time_constant: Lag | list[Lag] = 0.0
+    rate: Rate | list[Rate] | None = None
+
+    def made(self) -> ReferenceFilter:
+        return ReferenceFilter(**self.model_dump())
+
+
 class PublishedTable(Table):
     sparse_density: list[Number]
     tracking_error: Number
@@ -271,6 +295,7 @@ class ControllerTable(Table):
     around: Word = "mpc"
     on_limit_violation: Literal["keep_budget", "ignore_budget"] = "keep_budget"
     violation_margin: Values = 0.0
+    reference_filter: ReferenceFilterTable | None = None
     published: PublishedTable | None = None
 
     @model_validator(mode="after")

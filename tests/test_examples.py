@@ -1,0 +1,33 @@
+"""The studies in `examples/` run, and show what they say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mampc.study import load_study, run_study
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(scope="module")
+def found():
+    """The runs of an example by its name, each example run once."""
+    known = {}
+
+    def runs(name):
+        if name not in known:
+            known[name] = run_study(load_study(EXAMPLES / f"{name}.toml"))
+        return known[name].runs
+
+    return runs
+
+
+def largest_move(run):
+    return np.abs(np.diff(run.u, axis=0, prepend=run.u_initial[None])).max(axis=0)
+
+
+def test_filtered_references_need_smaller_moves(found):
+    runs = found("reference-filter")["noise-free"]
+    assert (largest_move(runs["MPC with a ramp"]) < largest_move(runs["MPC"]) / 3).all()
+    assert (largest_move(runs["price with a lag"]) < largest_move(runs["price"]) / 2).all()
