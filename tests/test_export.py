@@ -452,9 +452,9 @@ def test_missing_columns_are_all_named_with_a_guess(tmp_path):
 
 
 def test_tags_in_rows_are_told_from_missing_columns(tmp_path):
-    lines = [[time, tag, value] for time, u, y in rows() for tag, value in (("u", u), ("y", y))]
+    lines = [[time, tag, value, value] for time, u, y in rows() for tag, value in (("u", u), ("y", y))]
     with pytest.raises(MampcError, match="they stand in its rows: save one column a signal"):
-        read(tmp_path, text(lines, header=("time", "tag", "value")))
+        read(tmp_path, text(lines, header=("time", "tag", "a", "b")))
 
 
 def test_a_column_of_times_for_each_signal_counts_only_where_all_are_the_same(tmp_path):

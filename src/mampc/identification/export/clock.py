@@ -12,8 +12,9 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import shown
 from mampc.identification.export.findings import Findings, rows_text
+from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import POINT, clean, is_number, numeric_share
-from mampc.identification.export.sheet import Cells, Sheet, find_column
+from mampc.identification.export.sheet import Cells, Sheet
 from mampc.identification.export.stamps import (
     DATE_ONLY,
     SECONDS,
@@ -30,7 +31,7 @@ STAMP = re.compile(r"[^\d]{0,5}\d+[-/.:, T]+\w+[-/.:, T]+\d+.*|\d{8}[T ]\d{4,6}.
 CLOCK_ONLY = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AaPp][Mm])?")
 EXACT = ("time", "timestamp")
 LATEST = 4.2e9  # seconds: larger numbers are hardly seconds
-SPREADSHEET_DAYS = (36526.0, 73051.0)  # 2000 to 2100, counted as spreadsheets do
+DAYS = ((36526.0, 73051.0), (730486.0, 767011.0))  # 2000 to 2100, counted as spreadsheets and as MATLAB do
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
         how: what the user says about it.
         findings: receives notes and doubts.
     """
-    columns = _time_columns(sheet, taken, how, findings)
+    columns = time_columns(sheet, taken, how, findings)
     if not columns:
         return None
     name = " and ".join(sheet.header[at] for at in columns)
@@ -123,9 +124,7 @@ def _cell(sheet: Sheet, columns: Sequence[int], at: int) -> str:
     return shown(" ".join(str(sheet.column(column)[at]) for column in columns))
 
 
-def _time_columns(
-    sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: Findings
-) -> tuple[int, ...]:
+def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: Findings) -> tuple[int, ...]:
     """The column of times, or those of dates and of times of the day."""
     if how.time is not None:
         at = find_column(sheet.header, how.time)
@@ -226,7 +225,7 @@ def _from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) -
             f"times in column {name!r} are numbers as large as {most:.15g}; pass their unit (--time-unit) or their "
             "format (--time-format '%Y%m%d%H%M%S')"
         )
-    elif SPREADSHEET_DAYS[0] < least and most < SPREADSHEET_DAYS[1] and 0 < usual < 0.01:
+    elif any(first < least and most < last for first, last in DAYS) and 0 < usual < 0.01:
         findings.doubt(
             f"times in column {name!r} are numbers from {least:.10g} to {most:.10g}, seconds or days of a spreadsheet; "
             "pass their unit (--time-unit s, --time-unit d)"

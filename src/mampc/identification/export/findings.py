@@ -37,6 +37,13 @@ class Findings:
         if sentence not in self.doubts:
             self.doubts.append(sentence)
 
+    def take(self, other: Findings) -> None:
+        """All that another list holds."""
+        self.notes += other.notes
+        self.changes += other.changes
+        for sentence in other.doubts:
+            self.doubt(sentence)
+
     def require_none(self) -> None:
         """Raise one `MampcError` with every doubt, if there is any."""
         if not self.doubts:

@@ -10,7 +10,8 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
 from mampc.identification.export.findings import Findings
-from mampc.identification.export.sheet import Cells, Sheet, header_units, require_columns
+from mampc.identification.export.header import header_units, require_columns
+from mampc.identification.export.sheet import Cells, Sheet
 
 
 def frame_sheet(frame: Any, names: Sequence[str], findings: Findings) -> Sheet:

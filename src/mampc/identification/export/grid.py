@@ -222,7 +222,8 @@ def _each_once(
     findings.change(f"times stand more than once in {rows_text(sorted(rows))}; each kept once")
     if contradicting:
         places = rows_text(sorted(set(contradicting)))
-        findings.change(f"{places} contradict another row of the same time; neither is used")
+        verb = "contradicts" if len(set(contradicting)) == 1 else "contradict"
+        findings.change(f"{places} {verb} another row of the same time; neither is used")
     if len(repeated) > MOST_UNEVEN * len(first):
         findings.doubt(
             f"expected a time for each sample, received {len(repeated)} of {len(first)} times more than once, first in "

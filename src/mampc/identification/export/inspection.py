@@ -14,10 +14,12 @@ from mampc.base.checks import Array, as_number
 from mampc.identification.export.clock import Clock, read_clock
 from mampc.identification.export.findings import Findings, counted
 from mampc.identification.export.grid import make_grid, pieces
+from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Column, numeric_share, read_numbers
 from mampc.identification.export.quality import drop_bad_quality, is_quality
 from mampc.identification.export.reading import ReadingOptions, listed, readings
-from mampc.identification.export.sheet import Sheet, find_column, open_sheet
+from mampc.identification.export.sheet import Sheet
+from mampc.identification.export.tall import open_table
 
 HELD = 0.5  # share of samples: what keeps its value more often moves in steps
 FEW_MOVES = 10  # of an input; fewer say little about anything but the largest of them
@@ -105,7 +107,7 @@ def inspect_export(
     how, reading = readings(options, wanted or None)
     if dt is not None:
         dt = as_number("dt", dt, 0.0, exclusive=True)
-    sheet = open_sheet(source, wanted, findings)
+    sheet = open_table(source, wanted, how, findings)
     taken = [at for name in wanted if (at := find_column(sheet.header, name)) is not None]
     qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet.header, at)]
     clock = read_clock(sheet, [*taken, *qualities], how, findings)

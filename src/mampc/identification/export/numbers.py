@@ -18,6 +18,8 @@ PLAIN_CHARACTERS = frozenset("0123456789+-.eE \n")
 POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 GROUPED = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", re.ASCII)  # 1,234 or 1,234,567.8
 GROUPED_FOR_SURE = re.compile(r"[+-]?\d{1,3}((,\d{3})+\.\d*|(,\d{3}){2,})", re.ASCII)
+SPACE = re.compile("[\u00a0\u202f'’]")  # between groups of thousands; a plain space may part two numbers
+SPACED = re.compile(rf"[+-]?\d{{1,3}}({SPACE.pattern}\d{{3}})+(\.\d*)?", re.ASCII)
 EITHER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # 1,234: grouped thousands, or three decimals
 DIGIT = re.compile(r"\d")
 # Words that programs write in the place of a value with digits in them; a word without digits never is a number.
@@ -171,7 +173,12 @@ class _Reader:
         self._drop_out_of_range(rows)
         if not self.unclear and not self.either and np.isnan(column.values).all():
             found = ", ".join(list(column.marks)[:5])
-            findings.doubt(f"expected numbers in column {column.name!r}, received only {found}")
+            hint = (
+                ""
+                if set(column.marks) <= {"nothing"}
+                else "; save words that mean numbers, such as ON, as numbers"
+            )
+            findings.doubt(f"expected numbers in column {column.name!r}, received only {found}{hint}")
         return column
 
     def _number(self, at: int, cell: str, row: int) -> float:
@@ -180,6 +187,8 @@ class _Reader:
             self.column.mark(shown(cell), row)
             return np.nan
         word = cell.translate(SWAPPED) if self.decimal == "," else cell
+        if SPACED.fullmatch(word):
+            word = SPACE.sub("", word)
         if POINT.fullmatch(word):
             return float(word)
         if GROUPED.fullmatch(word):
@@ -240,7 +249,7 @@ def _decimal_mark(sheet: Sheet, columns: Sequence[int], findings: Findings) -> s
             for cell in cells if isinstance(cells, list) else ():
                 if "," not in cell and "." not in cell:
                     continue
-                word = clean(cell)
+                word = SPACE.sub("", clean(cell))
                 if EITHER.fullmatch(word):
                     either = either or word
                     continue
@@ -272,6 +281,6 @@ def _has_point(word: str) -> bool:
 
 def numeric_share(cells: Iterable[str]) -> float:
     """The share of numbers among the cells that hold anything, with either decimal mark; 0 where there is none."""
-    filled = [clean(cell) for cell in cells if cell]
-    numbers = sum(POINT.fullmatch(cell.replace(",", ".")) is not None for cell in filled)
+    filled = [SPACE.sub("", clean(cell)) for cell in cells if cell]
+    numbers = sum(map(is_number, filled))
     return numbers / len(filled) if filled else 0.0

@@ -11,8 +11,9 @@ import numpy as np
 from mampc.base.checks import BoolArray
 from mampc.base.errors import shown
 from mampc.identification.export.findings import Findings
+from mampc.identification.export.header import UNIT
 from mampc.identification.export.numbers import Column
-from mampc.identification.export.sheet import UNIT, Cells, Sheet
+from mampc.identification.export.sheet import Cells, Sheet
 
 WORDS = ("quality", "qual", "opcquality", "status", "validity", "qualität", "qualitaet", "qualité", "calidad")
 BEHIND_A_NAME = (*WORDS, "q", "qc", "st", "state", "flag", "good", "valid")

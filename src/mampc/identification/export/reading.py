@@ -18,10 +18,11 @@ from mampc.identification.data import IOData
 from mampc.identification.export.clock import Clock, read_clock
 from mampc.identification.export.findings import Findings, counted
 from mampc.identification.export.grid import STRAYING, Grid, bridged, make_grid, pieces, resampled
+from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Reading, read_numbers
 from mampc.identification.export.quality import drop_bad_quality, quality_columns
-from mampc.identification.export.sheet import find_column, open_sheet
 from mampc.identification.export.stamps import TimeReading
+from mampc.identification.export.tall import open_table
 
 
 class ReadingOptions(TypedDict, total=False):
@@ -111,7 +112,13 @@ def read_export(
     assert grid is not None  # else there is a doubt
     records, starts = _cut(table, grid, fill, findings)
     if not records:
-        raise MampcError(f"{origin}: expected consecutive rows with a number in every column, received none")
+        filled = np.count_nonzero(~np.isnan(table.values), axis=0)
+        counts = ", ".join(f"{count} of {name}" for name, count in zip(wanted, filled, strict=True))
+        raise MampcError(
+            f"{origin}: expected consecutive rows with a number in every column, received numbers in {counts} in "
+            f"{len(table.values)} rows; export all columns at the same times, or pass how many values in a row may be "
+            "made up (fill, --fill)"
+        )
     return Export(tuple(records), tuple(findings.notes), tuple(findings.changes), tuple(starts))
 
 
@@ -133,7 +140,7 @@ def _read_table(
     findings: Findings,
 ) -> _Table:
     wanted = (*names.inputs, *names.disturbances, *names.outputs)
-    sheet = open_sheet(source, wanted, findings)
+    sheet = open_table(source, wanted, how, findings)
     positions = {name: _position(sheet.header, name) for name in wanted}
     units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
     quality = tuple(quality_columns(sheet.header, positions))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 import re
 from array import array
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
@@ -19,6 +18,18 @@ import numpy.typing as npt
 from mampc.base.errors import MampcError, shown
 from mampc.base.files import read_bounded
 from mampc.identification.export.findings import Findings, rows_text
+from mampc.identification.export.header import (
+    Row,
+    find_column,
+    header_units,
+    header_with,
+    is_number_like,
+    joined_names,
+    likeliest_header,
+    likelihood,
+    require_columns,
+    without_empty_end,
+)
 from mampc.identification.export.workbook import read_parquet, read_workbook
 
 if TYPE_CHECKING:
@@ -26,15 +37,13 @@ if TYPE_CHECKING:
 
 FILE_LIMIT = 256 * 2**20  # bytes
 KIND = "CSV, Excel or Parquet file"
-SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 HEAD = 200  # rows among which the header is looked for
 CHUNK = 20_000  # rows parsed at a time
-UNIT = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")
 BINARY = re.compile(rb"[\x00-\x08\x0e-\x19\x1c-\x1f]|\x1a(?!\s*$)")
 
 # Words as they stand, numbers, or a pandas Series of times.
 Cells: TypeAlias = "list[str] | npt.NDArray[Any] | pd.Series"
-Row: TypeAlias = tuple[int, list[str]]  # its number in the file, its cells
 Rows: TypeAlias = Callable[[], Iterator[list[Row]]]  # all rows from the first on, in blocks
 
 
@@ -68,16 +77,6 @@ class Sheet:
         return [cell for part in parts for cell in part]
 
 
-def find_column(header: Sequence[str], name: str) -> int | None:
-    """The position of a name in a header, exactly or without the unit behind it; None unless there is one."""
-    for known in (list(header), [UNIT.sub("", word) for word in header]):
-        if known.count(name) == 1:
-            return known.index(name)
-        if name in known:
-            return None
-    return None
-
-
 def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
     """The table in a file, or in a pandas DataFrame.
 
@@ -108,7 +107,7 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
     def parsed(separator: str) -> Rows:
         def rows() -> Iterator[list[Row]]:
             text = io.TextIOWrapper(io.BytesIO(content), encoding=encoding, newline="")
-            reader = csv.reader(text, delimiter=separator)
+            reader = csv.reader(text, delimiter=separator, skipinitialspace=separator == " ")
             try:
                 while block := [(reader.line_num, row) for row in islice(reader, CHUNK)]:
                     yield block
@@ -160,20 +159,32 @@ def _row_sheet(
     found = None
     if names:
         fits = [
-            (s, rows, head, at) for s, rows, head in heads if (at := _header_with(head, names)) is not None
+            (s, rows, head, at) for s, rows, head in heads if (at := header_with(head, names)) is not None
         ]
         found = fits[0] if fits else None
         if len(fits) > 1 and readings[0][0] is None:
-            findings.doubt(f"expected one worksheet with these columns, received {len(fits)} of them")
+            findings.doubt(
+                f"expected one worksheet with these columns, received {len(fits)} of them; save the wanted ones as "
+                "files of their own"
+            )
     if found is None:
-        separator, rows, head = max(heads, key=lambda candidate: _evenness(candidate[2]))
-        found = separator, rows, head, _likeliest_header(head)
+        separator, rows, head = max(heads, key=likelihood)
+        found = separator, rows, head, likeliest_header(head)
     separator, rows, head, at = found
-    header_number, header_row = head[at]
-    header = _without_empty_end(header_row)
-    if at:
+    above, (header_number, header_row) = at, head[at]
+    header = without_empty_end(header_row)
+    if not all(find_column(header, name) is not None for name in names or header):
+        for k in (at - 1, at):
+            joined = joined_names(head[k : k + 2]) if k >= 0 else None
+            if joined and all(
+                find_column(joined, name) is not None for name in names or filter(None, joined)
+            ):
+                above, header_number, header = k, head[k + 1][0], joined
+                findings.note(f"names of columns stand in two rows: joined, such as {shown(joined[-1])}")
+                break
+    if above:
         findings.note(
-            f"{rows_text([number for number, _ in head[:at]])} before the header left out: "
+            f"{rows_text([number for number, _ in head[:above]])} before the header left out: "
             f"{shown(' '.join(cell for cell in head[0][1] if cell))}"
         )
     if names:
@@ -212,7 +223,7 @@ def _measured(
             broken.append(number)
         if len(sample) < 50:
             cells = _stripped(row)
-            if not numbers and not any(_is_number_like(cells[at]) for at in positions):
+            if not numbers and not any(is_number_like(cells[at]) for at in positions):
                 descriptions.append((number, cells))
                 continue
             sample.append(cells[:width])
@@ -284,7 +295,7 @@ def _without_footer(
         (number, cells)
         for number, cells in ragged
         if sum(map(bool, cells)) == 1
-        and not any(map(_is_number_like, cells))
+        and not any(map(is_number_like, cells))
         and numbers
         and number > numbers[-1]
     ]
@@ -296,65 +307,3 @@ def _without_footer(
 
 def _stripped(row: Sequence[str]) -> list[str]:
     return [cell.strip() for cell in row]
-
-
-def _without_empty_end(row: Sequence[str]) -> tuple[str, ...]:
-    width = max(i + 1 for i, cell in enumerate(row) if cell)
-    return tuple(row[:width])
-
-
-def _is_number_like(cell: str) -> bool:
-    return re.fullmatch(r"[+\-−]?[\d.,]*\d[\d.,]*([eE][+\-]?\d+)?", cell, re.ASCII) is not None
-
-
-def _header_with(head: Sequence[tuple[int, list[str]]], names: Sequence[str]) -> int | None:
-    """The first row in which all names stand."""
-    for i, (_, row) in enumerate(head):
-        plain = {UNIT.sub("", cell) for cell in row} | set(row)
-        if len(row) > 1 and all(name in plain for name in names):
-            return i
-    return None
-
-
-def _evenness(head: Sequence[tuple[int, list[str]]]) -> int:
-    """How many cells stand in rows of the most frequent width above one."""
-    widths = [len(row) for _, row in head if len(row) > 1]
-    return max((widths.count(width) * width for width in set(widths)), default=0)
-
-
-def _likeliest_header(head: Sequence[tuple[int, list[str]]]) -> int:
-    """The first row of words that is as wide as most rows, else the first row."""
-    widths = [len(_without_empty_end(row)) for _, row in head]
-    usual = max(set(widths), key=lambda width: (widths.count(width) * width, width))
-    for i, (_, row) in enumerate(head):
-        if widths[i] >= usual > 1 and not any(_is_number_like(cell) for cell in row):
-            return i
-    return 0
-
-
-def header_units(header: Sequence[str]) -> dict[int, str]:
-    found = {at: UNIT.search(name) for at, name in enumerate(header)}
-    return {at: match.group(1) for at, match in found.items() if match}
-
-
-def require_columns(
-    header: Sequence[str], names: Sequence[str], findings: Findings, cells: Collection[str] = ()
-) -> None:
-    """Raise `MampcError` unless each name stands once in the header; `cells` are some of those under it."""
-    missing = [name for name in names if find_column(header, name) is None]
-    if not missing:
-        return
-    alike = {word.casefold(): word for word in header}
-    guesses = {
-        name: alike.get(name.casefold()) or next(iter(difflib.get_close_matches(name, header, n=1)), None)
-        for name in missing
-        if name not in header
-    }
-    hints = [f"did you mean {guess!r} for {name!r}?" for name, guess in guesses.items() if guess]
-    if all(name in cells for name in missing):
-        hints.append("they stand in its rows: save one column a signal, as a pivot table does")
-    wanted = " and one ".join(repr(name) for name in missing)
-    findings.doubt(
-        "; ".join([f"expected one column {wanted}, received columns {shown(list(header), 400)}", *hints])
-    )
-    findings.require_none()

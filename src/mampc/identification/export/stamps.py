@@ -35,6 +35,7 @@ MONTH_FIRST = (
     "%m/%d/%Y", "%m-%d-%Y", "%m/%d/%y", "%m-%d-%y", "%b %d, %Y", "%b %d %Y", "%B %d, %Y",
 )  # fmt: skip
 YEAR_FIRST = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d")
+UTC = re.compile(r" ?(UTC|GMT)$")
 HOUR = 3600.0
 
 
@@ -102,7 +103,7 @@ def from_stamps(
     cells: Cells, how: TimeReading, sheet: Sheet, name: str, findings: Findings
 ) -> tuple[Array, Any]:
     """Seconds after the first stamp, and that stamp."""
-    words = [" ".join(cell.split()) for cell in cells]
+    words = [UTC.sub("+00:00", " ".join(cell.split())) for cell in cells]
     offsets = [cell for cell in words if _has_offset(cell)]
     if offsets and len(offsets) < 0.9 * sum(map(bool, words)):
         findings.doubt(
@@ -211,7 +212,8 @@ def since_first(stamps: Any, how: TimeReading, sheet: Sheet, findings: Findings)
 def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
     """Local stamps in their zone; of a doubled hour, the order of rows tells which is which."""
     known = stamps[stamps.notna()]
-    backwards = len(known) > 1 and known.iloc[0] > known.iloc[-1]
+    steps = known.diff().dt.total_seconds().to_numpy()[1:]
+    backwards = bool((steps < 0).sum() > (steps > 0).sum())
     known = known.iloc[::-1] if backwards else known
     try:
         read = known.dt.tz_localize(zone, ambiguous="infer", nonexistent="NaT")
@@ -224,9 +226,9 @@ def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
 def _clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Findings) -> Array:
     """Local time in the order of rows, with an hour added where the clock was put back an hour."""
     known = np.flatnonzero(~np.isnan(seconds))
-    newest_first = len(known) > 1 and seconds[known[0]] > seconds[known[-1]]
-    known = known[::-1] if newest_first else known
     steps = np.diff(seconds[known])
+    if (steps < 0).sum() > (steps > 0).sum():  # the newest first
+        known, steps = known[::-1], -steps[::-1]
     if len(steps) < 3 or not (steps > 0).any():
         return seconds
     usual = float(np.median(steps[steps > 0]))

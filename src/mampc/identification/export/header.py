@@ -1,0 +1,114 @@
+"""Which row of a file is its header, and what the columns are called."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Collection, Sequence
+from typing import Any, TypeAlias
+
+from mampc.base.errors import shown
+from mampc.identification.export.findings import Findings
+
+UNIT = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")
+
+Row: TypeAlias = tuple[int, list[str]]  # its number in the file, its cells
+
+
+def find_column(header: Sequence[str], name: str) -> int | None:
+    """The position of a name in a header, exactly or without the unit behind it; None unless there is one."""
+    for known in (list(header), [UNIT.sub("", word) for word in header]):
+        if known.count(name) == 1:
+            return known.index(name)
+        if name in known:
+            return None
+    return None
+
+
+def header_units(header: Sequence[str]) -> dict[int, str]:
+    found = {at: UNIT.search(name) for at, name in enumerate(header)}
+    return {at: match.group(1) for at, match in found.items() if match}
+
+
+def require_columns(
+    header: Sequence[str], names: Sequence[str], findings: Findings, cells: Collection[str] = ()
+) -> None:
+    """Raise `MampcError` unless each name stands once in the header; `cells` are some of those under it."""
+    missing = [name for name in names if find_column(header, name) is None]
+    if not missing:
+        return
+    alike = {word.casefold(): word for word in header}
+    guesses = {
+        name: alike.get(name.casefold()) or next(iter(difflib.get_close_matches(name, header, n=1)), None)
+        for name in missing
+        if name not in header
+    }
+    hints = [f"did you mean {guess!r} for {name!r}?" for name, guess in guesses.items() if guess]
+    if any(name in header for name in missing):
+        hints.append("a name that stands twice says nothing: rename columns")
+    elif all(name in cells for name in missing):
+        hints.append("they stand in its rows: save one column a signal, as a pivot table does")
+    wanted = " and one ".join(repr(name) for name in missing)
+    findings.doubt(
+        "; ".join([f"expected one column {wanted}, received columns {shown(list(header), 400)}", *hints])
+    )
+    findings.require_none()
+
+
+def header_with(head: Sequence[Row], names: Sequence[str]) -> int | None:
+    """The first row in which all names stand."""
+    for i, (_, row) in enumerate(head):
+        plain = {UNIT.sub("", cell) for cell in row} | set(row)
+        if len(row) > 1 and all(name in plain for name in names):
+            return i
+    return None
+
+
+def joined_names(pair: Sequence[Row]) -> tuple[str, ...] | None:
+    """Names out of two rows, such as "TI-1.PV"; an empty cell of the upper one goes on with what stands left of it."""
+    if len(pair) < 2 or any(is_number_like(cell) for _, row in pair for cell in row):
+        return None
+    lower = without_empty_end(pair[1][1])
+    upper = [*pair[0][1], *([""] * len(lower))][: len(lower)]
+    if sum(map(bool, upper)) < 2:
+        return None
+    names, last = [], ""
+    for one, other in zip(upper, lower, strict=True):
+        last = one or last
+        names.append(f"{last}.{other}" if last and other else last or other)
+    return tuple(names)
+
+
+def likelihood(reading: tuple[str | None, Any, Sequence[Row]]) -> tuple[bool, bool, int]:
+    """How likely fields are parted right: not by spaces, which stamps and words have too, unless nothing else parts
+    them; with a header for most rows; and in how many cells.
+    """
+    separator, _, head = reading
+    even = _evenness(head)
+    headed = even > 0 and len(without_empty_end(head[likeliest_header(head)][1])) > 1
+    return separator != " " and even > 0, headed, even
+
+
+def likeliest_header(head: Sequence[Row]) -> int:
+    """The first row of words that is as wide as most rows, else the first row."""
+    widths = [len(without_empty_end(row)) for _, row in head]
+    usual = max(set(widths), key=lambda width: (widths.count(width) * width, width))
+    for i, (_, row) in enumerate(head):
+        if widths[i] >= usual > 1 and not any(is_number_like(cell) for cell in row):
+            return i
+    return 0
+
+
+def _evenness(head: Sequence[Row]) -> int:
+    """How many cells stand in rows of the most frequent width above one."""
+    widths = [len(row) for _, row in head if len(row) > 1]
+    return max((widths.count(width) * width for width in set(widths)), default=0)
+
+
+def without_empty_end(row: Sequence[str]) -> tuple[str, ...]:
+    width = max(i + 1 for i, cell in enumerate(row) if cell)
+    return tuple(row[:width])
+
+
+def is_number_like(cell: str) -> bool:
+    return re.fullmatch(r"[+\-−]?[\d.,]*\d[\d.,]*([eE][+\-]?\d+)?", cell, re.ASCII) is not None

@@ -1,0 +1,213 @@
+"""Forms of exports of historians, control systems and loggers, made up: each is read as it was meant, or refused."""
+
+import numpy as np
+import pytest
+
+import mampc
+from mampc import MampcError, read_export
+from mampc.identification.export import inspect_export
+
+pd = pytest.importorskip("pandas")
+U = np.repeat([45.0, 55.0, 45.0, 55.0], 5)
+Y = np.round(300.0 + np.cumsum(U - 50) / 20, 3)
+FIRST = pd.Timestamp("2024-05-17 13:57:00")
+
+
+def stamp(k, form="%Y-%m-%d %H:%M:%S", dt=10.0):
+    return (FIRST + pd.Timedelta(seconds=k * dt)).strftime(form)
+
+
+def rows(line, header, end=()):
+    return (
+        "\r\n".join([*header, *(line(k, u, y) for k, (u, y) in enumerate(zip(U, Y, strict=True))), *end])
+        + "\r\n"
+    )
+
+
+def read(tmp_path, content, **options):
+    path = tmp_path / "export.csv"
+    path.write_text(content, encoding="utf-8", newline="")
+    return read_export(path, **{"inputs": "u", "outputs": "y"} | options)
+
+
+def assert_whole(export, dt=10.0, factor=1.0):
+    [record] = export.records
+    assert record.dt == dt
+    np.testing.assert_allclose(record.u[:, 0], factor * U, rtol=1e-12)
+    np.testing.assert_allclose(record.y[:, 0], Y, rtol=1e-12)
+
+
+def comma(value, digits=3):
+    return f"{value:.{digits}f}".replace(".", ",")
+
+
+TALL = {
+    "interleaved": rows(
+        lambda k, u, y: f"u;{stamp(k)};{u};Good\r\ny;{stamp(k)};{y};Good", ["tag;timestamp;value;quality"]
+    ),
+    "tag after tag": "\r\n".join(
+        [
+            "Variable;Zeit;Wert;Status",
+            *(f"u;{stamp(k, '%d.%m.%Y %H:%M:%S')};{comma(u)};OK" for k, u in enumerate(U)),
+            *(f"y;{stamp(k, '%d.%m.%Y %H:%M:%S')};{comma(y)};OK" for k, y in enumerate(Y)),
+        ]
+    ),
+    "several columns of values": rows(
+        lambda k, u, y: f"{stamp(k)},u,{u},{u},0,192\r\n{stamp(k)},y,{y},{y},0,192",
+        ["DateTime,TagName,Value,vValue,Quality,QualityDetail"],
+    ),
+    "no name that is known": rows(lambda k, u, y: f"{stamp(k)},u,{u}\r\n{stamp(k)},y,{y}", ["T,S,X"]),
+    "dates and times": rows(
+        lambda k, u, y: f"u,{stamp(k, '%d.%m.%Y,%H:%M:%S')},{u}\r\ny,{stamp(k, '%d.%m.%Y,%H:%M:%S')},{y}",
+        ["Tag,Date,Time,Value"],
+    ),
+    "a tag that nobody wants": rows(
+        lambda k, u, y: f"u,{stamp(k)},{u}\r\nz,{stamp(k, dt=7.3)},1\r\ny,{stamp(k)},{y}", ["tag,time,value"]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", TALL)
+def test_a_row_for_every_value_becomes_a_column_for_every_tag_and_is_told(tmp_path, form):
+    export = read(tmp_path, TALL[form])
+    assert_whole(export)
+    assert any("a row for every value" in note for note in export.notes)
+
+
+def test_marks_qualities_and_contradictions_in_tall_tables(tmp_path):
+    def line(k, u, y):
+        return f"u,{stamp(k)},{u},Good\r\ny,{stamp(k)},{'Bad' if k == 4 else y},{'Bad' if k == 9 else 'Good'}"
+
+    export = read(tmp_path, rows(line, ["tag,time,value,quality"], [f"y,{stamp(14)},1.0,Good"]))
+    assert [len(record) for record in export.records] == [4, 4, 4, 5]
+    assert all(record.y.min() > 290 for record in export.records)
+    assert any("contradicts another row of the same time" in note for note in export.notes)
+
+
+def test_tall_tables_are_inspected_tag_by_tag(tmp_path):
+    path = tmp_path / "export.csv"
+    path.write_text(TALL["interleaved"])
+    seen = inspect_export(path)
+    assert [column.name for column in seen.columns] == ["u", "y"]
+    assert seen.dt == 10.0
+
+
+def test_tags_at_times_of_their_own_are_refused(tmp_path):
+    def line(k, u, y):
+        return f"u,{stamp(k)},{u}\r\ny,{stamp(k, dt=10.3)},{y}"
+
+    with pytest.raises(MampcError, match="expected"):
+        read(tmp_path, rows(line, ["tag,time,value"]))
+
+
+FORMS = {
+    "groups of thousands between no-break spaces": (
+        rows(lambda k, u, y: f"{stamp(k)};{u * 100:,.2f};{y}".replace(",", "\u00a0").replace(".", ","), ["time;u;y"]),
+        100.0,
+    ),
+    "groups of thousands between apostrophes": (
+        rows(lambda k, u, y: f"{stamp(k)};{u * 100:,.2f};{y}".replace(",", "'"), ["time;u;y"]),
+        100.0,
+    ),
+    "columns between spaces": (
+        rows(lambda k, u, y: f"{10 * k:7d}  {u:5.1f}  {y:9.3f} ", ["   time      u       y"]),
+        1.0,
+    ),
+    "a line under the header": (
+        rows(lambda k, u, y: f"{stamp(k)},{u},{y}", ["time,u,y", "----,--,--"], ["", "(20 rows affected)"]),
+        1.0,
+    ),
+    "UTC in words": (rows(lambda k, u, y: f"{stamp(k)} UTC,{u},{y}", ["time,u,y"]), 1.0),
+    "sums and means at the end": (
+        rows(lambda k, u, y: f"{stamp(k)},{u},{y}", ["time,u,y"], ["Average,50,300", "Max,55,310"]),
+        1.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_forms(tmp_path, form):
+    content, factor = FORMS[form]
+    assert_whole(read(tmp_path, content), factor=factor)
+    path = tmp_path / "export.csv"
+    assert [column.name for column in inspect_export(path).columns] == ["u", "y"]
+
+
+def test_names_in_two_rows_are_joined_and_told(tmp_path):
+    content = rows(lambda k, u, y: f"{stamp(k)},{u},1,{y}", [",FIC-1,,TI-1", "time,OP,PV,PV"])
+    export = read(tmp_path, content, inputs="FIC-1.OP", outputs="TI-1.PV")
+    assert_whole(export)
+    assert any("two rows" in note for note in export.notes)
+    assert [column.name for column in inspect_export(tmp_path / "export.csv").columns] == [
+        "FIC-1.OP", "FIC-1.PV", "TI-1.PV"
+    ]  # fmt: skip
+    with pytest.raises(MampcError, match=r"'PV'.*a name that stands twice says nothing"):
+        read(tmp_path, content, inputs="OP", outputs="PV")
+
+
+def test_decimal_commas_in_stamps_do_not_part_fields(tmp_path):
+    content = rows(
+        lambda k, u, y: f"{stamp(k, '%d.%m.%Y %H:%M:%S')},000;{comma(u)};{comma(y)}", ["Zeit;u [%];y [°C]"]
+    )
+    assert_whole(read(tmp_path, content))
+    assert [column.unit for column in inspect_export(tmp_path / "export.csv").columns] == ["%", "°C"]
+
+
+def test_the_clock_that_goes_back_among_the_first_rows_does_not_turn_the_record_round(tmp_path):
+    times = pd.date_range("2024-10-27 00:58:40", periods=len(U), freq="10s", tz="UTC").tz_convert(
+        "Europe/Berlin"
+    )
+    content = rows(lambda k, u, y: f"{times[k]:%Y-%m-%d %H:%M:%S},{u},{y}", ["time,u,y"])
+    assert_whole(read(tmp_path, content))
+    assert_whole(read(tmp_path, content, time_zone="Europe/Berlin"))
+
+
+def test_days_of_matlab_are_asked_about(tmp_path):
+    content = rows(lambda k, u, y: f"{739023.5 + k / 8640:.9f},{u},{y}", ["time,u,y"])
+    with pytest.raises(MampcError, match="seconds or days"):
+        read(tmp_path, content)
+    [record] = read(tmp_path, content, time_unit="d").records
+    assert record.dt == 10.0
+
+
+def test_inputs_that_stand_only_where_they_change_are_refused_with_what_closes_them(tmp_path):
+    content = rows(lambda k, u, y: f"{stamp(k)},{u if k % 5 == 0 else ''},{y}", ["time,u,y"])
+    with pytest.raises(MampcError, match=r"numbers in 4 of u, 20 of y in 20 rows.*--fill"):
+        read(tmp_path, content)
+    [record] = read(tmp_path, content, fill=4).records
+    np.testing.assert_array_equal(record.u[:, 0], U[: len(record)])
+
+
+@pytest.mark.parametrize("words", [("ON", "OFF"), ("TRUE", "FALSE"), ("AUTO", "MAN")])
+def test_words_are_no_numbers_and_the_refusal_says_what_to_do(tmp_path, words):
+    content = rows(lambda k, u, y: f"{stamp(k)},{words[int(u > 50)]},{y}", ["time,u,y"])
+    with pytest.raises(MampcError, match="save words that mean numbers"):
+        read(tmp_path, content)
+
+
+@pytest.mark.parametrize(
+    "mark",
+    [
+        "Bad", "Bad Input", "-9999", "1.#QNAN", "-1.#IND", "NULL", "#N/A", "Configure", "Pt Created", "No Data",
+        "I/O Timeout", "Scan Off", "Arc Off-line", "Calc Failed", "????", "---", "(null)", "<null>", "1e38", "#REF!",
+        "ERR 14", "12.3 BAD", "65535", "-999.25", "∞", "[-11059] No Good Data For Calculation",
+    ],
+)  # fmt: skip
+def test_no_number_comes_from_a_mark(tmp_path, mark):
+    content = rows(lambda k, u, y: f"{stamp(k)},{u},{mark if k == 9 else y}", ["time,u,y"])
+    export = read(tmp_path, content)
+    assert [len(record) for record in export.records] == [9, 10]
+    assert any(note.startswith("y: no number in 1 of 20 rows") and "row 11" in note for note in export.notes)
+
+
+def test_worksheets_with_the_same_columns_are_asked_about(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for sheet in (book.active, book.create_sheet("June")):
+        sheet.append(["time", "u", "y"])
+        for k, (u, y) in enumerate(zip(U, Y, strict=True)):
+            sheet.append([(FIRST + pd.Timedelta(seconds=10 * k)).to_pydatetime(), u, y])
+    book.create_sheet("Notes").append(["written by hand"])
+    book.save(tmp_path / "export.xlsx")
+    with pytest.raises(MampcError, match=r"one worksheet.*2 of them; save"):
+        mampc.read_export(tmp_path / "export.xlsx", inputs="u", outputs="y")
