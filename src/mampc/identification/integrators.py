@@ -10,7 +10,6 @@ the model with them moved there, everything else fitted again, explains the reco
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import schur, solve_sylvester
 
 from mampc.base.checks import Array
 
@@ -32,6 +31,8 @@ def with_integrators(A: Array, C: Array, count: int) -> tuple[Array, Array]:
     distance = np.sort(np.abs(np.linalg.eigvals(A) - 1.0))
     radius = np.inf if count == n else np.sqrt(distance[count - 1] * distance[count])
     radius = max(radius, distance[count - 1] * (1 + 1e-12))
+    from scipy.linalg import schur, solve_sylvester
+
     S, Q, found = schur(A, output="real", sort=lambda re, im: np.hypot(re - 1.0, im) <= radius)
     if found != count:
         raise ValueError(f"expected {count} poles near one, found {found}")

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import matrix_balance, null_space
 
 from mampc.base.checks import Array
 from mampc.program.daqp import DaqpSolver
@@ -38,6 +37,8 @@ class SteadyTarget:
     """Finds the steady target of a problem's model; one small program a change of reference or disturbance."""
 
     def __init__(self, problem: TrackingProblem, parameter: Parameter) -> None:
+        from scipy.linalg import matrix_balance, null_space
+
         self._problem, self._parameter = problem, parameter
         model = problem.model
         n, m, l = model.n_states, model.n_inputs, model.n_outputs
