@@ -269,8 +269,10 @@ def test_a_list_of_plants_needs_one_per_seed():
 
 
 def bank_regulator(problem, rules, noise):
-    controller = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules)
-    return mampc.Regulator(controller, mampc.LoadBank(problem.model, noise=noise))
+    bank = mampc.LoadBank(problem.model, noise=noise)
+    if rules is None:
+        return mampc.Regulator(mampc.MPC(problem), bank)
+    return mampc.Regulator(mampc.MAMPC(problem, rules), bank, value_of_information=True)
 
 
 @pytest.mark.parametrize("name", ["plain", "price", "budget and price"])

@@ -125,6 +125,7 @@ class Controller(ABC):
         measured_disturbance: Array | None = None,
         limits: Limits | None = None,
         manual: Any = None,
+        hypotheses: Array | None = None,
     ) -> Decision:
         """Decide the inputs of this sample.
 
@@ -141,6 +142,7 @@ class Controller(ABC):
                 i = 1..np. Inputs stay within the limits of the problem too, outputs have these instead.
             manual: which inputs somebody else moves now, bool, shape (m,); they are planned to stay where they are,
                 beyond their limits too.
+            hypotheses: how likely each hypothesis about the loads is, shape (B,), for plans that count on later data.
 
         Returns:
             A `Decision`. Numbers that `is_usable` refuses lead to a held input and a status, not to an error.
@@ -170,7 +172,7 @@ class Controller(ABC):
             if limits_now.crossed:
                 plan = Plan(None, Status.HELD_INFEASIBLE, 0)
             else:
-                sample = limits_now.applied_to(sample)
+                sample = self._with_later_data(limits_now.applied_to(sample), hypotheses)
                 plan = self._plan_from(state, sample, limits_now)
         if plan.moves is None or sample is None:
             plan = self._to_hold(plan, sample, state, limits_now.inputs)
@@ -213,6 +215,7 @@ class Controller(ABC):
                 # Where holding keeps the limits nothing is infeasible, and it was the numbers that failed.
                 return plan._replace(status=Status.HELD_SOLVER_FAILED) if self._may_hold(sample) else plan
         back = way_back(state, sample, limits, self.condensed)
+        back.sample.later_data = sample.later_data
         return back.joined(self.plan(back.sample, back.state))
 
     def _may_hold(self, sample: Sample) -> bool:
@@ -224,9 +227,13 @@ class Controller(ABC):
             for rows in (moves, inputs)
         )
 
-    def _charge(self, moves: Array) -> float:
-        """The price of moves, shape (n_moves,), which the tracking problem's own objective does not have."""
+    def _charge(self, moves: Array, sample: Sample) -> float:
+        """What moves, shape (n_moves,), cost beside the tracking problem's own objective."""
         return 0.0
+
+    def _with_later_data(self, sample: Sample, hypotheses: Array | None) -> Sample:
+        """The sample, for plans that count on later data with what patterns forgo of these."""
+        return sample
 
     @abstractmethod
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
@@ -259,7 +266,7 @@ class Controller(ABC):
             status, lower_bound, objective, violations = Status.FEASIBLE, -np.inf, None, None
         moves = changes.ravel()
         if objective is None:
-            objective = self.condensed.cost(sample, moves) + self._charge(moves)
+            objective = self.condensed.cost(sample, moves) + self._charge(moves, sample)
         if violations is None and self.condensed.n_violations:
             violations = self.condensed.violations(sample, moves)
         for array in (changes, kept, violations):

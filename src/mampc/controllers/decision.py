@@ -49,7 +49,8 @@ class Decision(NamedTuple):
         changes: planned moves du, shape (nc, m); with an exact pattern (polish) zero off it.
         status: how the decision came about.
         objective: cost of the plan: tracking over i = 0..np, move weights over j = 0..nc-1, output-limit
-            penalty, price of the planned moves; not-a-number where nothing was solved.
+            penalty, price of the planned moves, and for plans that count on later data what their pattern forgoes of
+            these (`moves.information`); not-a-number where nothing was solved.
         lower_bound: no admissible plan costs less; minus infinity where nothing is proven.
         iterations: solver iterations (MPC) or rounds of the method.
         solve_time: seconds from call to answer.

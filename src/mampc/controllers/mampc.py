@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from mampc.controllers.decision import ControllerState
 from mampc.methods.method import Method, Plan
 from mampc.methods.registry import method_of
 from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.information import Information
 from mampc.moves.rounding import without_rounding
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import TrackingProblem
@@ -74,6 +76,7 @@ class MAMPC(Controller):
         )
         self._check_sizes()
         self._rounding = ROUNDING * self.condensed.move_prefix
+        self.information: Information | None = None
         # Without any rule this is plain MPC.
         self._search = None if self._admissible.unrestricted else self.method.prepare(self.condensed, rules)
 
@@ -87,8 +90,20 @@ class MAMPC(Controller):
             if (size > most).any():
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
-    def _charge(self, moves: Array) -> float:
-        return self._admissible.charge(np.abs(moves) > SAME * self.condensed.move_prefix)
+    def with_information(self, shifts: Array) -> MAMPC:
+        """This controller with plans that count on later data; `shifts` as `Information` takes them."""
+        counting = copy(self)
+        counting.information = Information(self.problem, shifts)
+        return counting
+
+    def _with_later_data(self, sample: Sample, hypotheses: Array | None) -> Sample:
+        if self.information is not None and hypotheses is not None:
+            sample.later_data = self.information.at(hypotheses)
+        return sample
+
+    def _charge(self, moves: Array, sample: Sample) -> float:
+        pattern = np.abs(moves) > SAME * self.condensed.move_prefix
+        return self._admissible.charge(pattern) + sample.forgone(pattern)
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
         search = self._search
@@ -109,7 +124,9 @@ class MAMPC(Controller):
         if np.count_nonzero(np.abs(plan.moves) > self._rounding) == np.count_nonzero(plan.moves):
             return plan
         moves = without_rounding(self.condensed, sample, plan.moves)
-        return plan._replace(moves=moves, inputs=None, objective=None)
+        # A move that later data will decide may be planned though nothing calls for it yet.
+        objective = None if sample.later_data is None else plan.objective
+        return plan._replace(moves=moves, inputs=None, objective=objective)
 
     def _unless_urgent(self, plan: Plan, sample: Sample, state: ControllerState, margin: Array) -> Plan:
         """The plan, or that of plain MPC where the rules would cost a violation beyond the margin."""

@@ -315,7 +315,9 @@ class _Loops:
         parameters[:, place.one.stop :] = ahead
         parameters -= place.origin[parameters.shape[1]]
         usable: BoolArray = np.asarray((np.abs(parameters) < LARGEST).all(axis=1))
-        decided, first = self._plans.decide(np.where(usable[:, None], parameters, 0.0), self._inputs)
+        decided, first = self._plans.decide(
+            np.where(usable[:, None], parameters, 0.0), self._inputs, estimator.weights_of(estimate)
+        )
         decided &= fine & usable
         one_by_one = np.flatnonzero(~decided).tolist()
         before = [self._state(s, k) for s in one_by_one]

@@ -62,12 +62,15 @@ class BatchedPlans:
         self._free = Maps(list(self._units), m)
         self.memory = controller.memory
 
-    def decide(self, parameters: Array, inputs: Array) -> tuple[BoolArray, Array]:
+    def decide(
+        self, parameters: Array, inputs: Array, hypotheses: Array | None = None
+    ) -> tuple[BoolArray, Array]:
         """Which loops are decided, shape (S,), and their inputs, shape (S, m).
 
         Args:
             parameters: of `Parameter`, shape (S, p).
             inputs: applied so far, latest last, shape (S, h, m).
+            hypotheses: how likely each one is, shape (S, B), for plans that count on later data.
         """
         decided, _, first = self._free.at(parameters)
         return decided & ((first >= self._low) & (first <= self._high)).all(axis=1), first
@@ -81,6 +84,7 @@ class BatchedExact(BatchedPlans):
     ) -> None:
         super().__init__(controller, preview)
         self._admissible, self._patterns = admissible, patterns
+        self._information = controller.information
         self._counts = np.array([admissible.count(pattern) for pattern in patterns])
         self._charge = np.array([admissible.charge(pattern) for pattern in patterns])
         U = self._condensed.U
@@ -102,11 +106,13 @@ class BatchedExact(BatchedPlans):
         self._allowances: dict[bytes, Allowance] = {}
         self._costs: dict[Allowance, Array] = {}
 
-    def decide(self, parameters: Array, inputs: Array) -> tuple[BoolArray, Array]:
+    def decide(
+        self, parameters: Array, inputs: Array, hypotheses: Array | None = None
+    ) -> tuple[BoolArray, Array]:
         first = inputs[:, -1].copy()
         decided: BoolArray = ((first >= self._low) & (first <= self._high)).all(axis=1)
         optima = self._free.at(parameters)[1] * self._size
-        best, clear = self._best(optima, inputs)
+        best, clear = self._best(optima, inputs, hypotheses)
         decided &= clear
         order = np.argsort(best, kind="stable")
         ends = np.flatnonzero(np.diff(best[order], append=-1))
@@ -121,11 +127,13 @@ class BatchedExact(BatchedPlans):
         return decided, first
 
     def _best(
-        self, optima: Array, inputs: Array
+        self, optima: Array, inputs: Array, hypotheses: Array | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.intp]], BoolArray]:
         """The best pattern of each loop, shape (S,), and whether no other is as good."""
         best, clear = np.empty(len(optima), dtype=np.intp), np.empty(len(optima), dtype=bool)
         costs = self._pattern_costs(inputs)
+        if self._information is not None and hypotheses is not None:
+            costs = costs + hypotheses @ self._information.table(self._patterns).T
         block = max(1, BLOCK // len(self._patterns))
         for start in range(0, len(optima), block):
             part = slice(start, start + block)

@@ -110,6 +110,18 @@ class Estimator(ABC):
             loads: `loads_of` the estimate when the number that is stuck first came, shape (l, k).
         """
 
+    def shifts(self, samples: int) -> Array | None:
+        """What innovations at the samples 1 .. `samples` will do to the estimate; None where that is not known.
+
+        Of (x, d_u, d_y) at that sample, per unit of white innovations and under each of B hypotheses,
+        shape (B, samples, n + m + l, l).
+        """
+        return None
+
+    def weights_of(self, estimate: Estimate) -> Array | None:
+        """How likely each hypothesis is, shape (B,), or loops first, (S, B); None for estimators without any."""
+        return None
+
     def load(self, estimate: Estimate) -> LoadKind | None:
         """What loads seem to do, in words; None for estimators that do not ask."""
         return None

@@ -167,6 +167,18 @@ class LoadBank(Estimator):
         fading = [-s / (1 - kept) if a == kept else 0 * s for a in self._kept]
         return np.vstack([x, *fading, loads.at_inputs @ lasting, loads.at_outputs @ lasting])
 
+    def shifts(self, samples: int) -> Array:
+        """See `Estimator.shifts`."""
+        everything, shifts = self._all, []
+        for b, member in enumerate(self.members):
+            root = np.linalg.cholesky(member.innovation_covariance(everything))
+            shifts.append(self.to_plan(b) @ member.gain(everything) @ root)
+        return np.tile(np.stack(shifts)[:, None], (1, samples, 1, 1))
+
+    def weights_of(self, estimate: Estimate) -> Array:
+        """See `Estimator.weights_of`."""
+        return _bank(estimate).weights
+
     def load(self, estimate: Estimate) -> LoadKind:
         """The hypothesis that is the most likely one, in words."""
         return self.hypotheses[int(_bank(estimate).weights.argmax())].load

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import LARGEST, Array, as_read, as_shaped, as_vector, as_whole, is_usable
+from mampc.base.checks import LARGEST, Array, as_flag, as_read, as_shaped, as_vector, as_whole, is_usable
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
+from mampc.controllers.mampc import MAMPC
 from mampc.loop.actuators import LATEST, Actuators
 from mampc.loop.estimation import Estimate, Estimator, KalmanFilter
 from mampc.loop.reference_filter import ReferenceFilter
@@ -30,6 +31,8 @@ class Regulator:
         sensors: when a measurement is believed; default `SensorChecks()`.
         max_blind_steps: samples in a row that inputs are still planned, on predictions, though no output at
             all is believed; from then on they are held until one is. 0 holds at once.
+        value_of_information: plan with what later measurements will tell (see docs/how-it-decides.md): needs `MAMPC`
+            and an estimator that knows the noise in output units, a `LoadBank`.
         applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
             position feedback are never exact. In input units, a scalar or (m,); default a hundredth of the
             input's range, or 1e-6 where that is not finite.
@@ -47,6 +50,7 @@ class Regulator:
         *,
         sensors: SensorChecks | None = None,
         max_blind_steps: int = 0,
+        value_of_information: bool = False,
         applied_tolerance: Any = None,
         reference_filter: ReferenceFilter | None = None,
     ) -> None:
@@ -86,6 +90,9 @@ class Regulator:
         self._planner = controller
         if self.estimator.planning_model is not self.estimator.model:
             self._planner = controller.with_model(self.estimator.planning_model)
+        self.value_of_information = as_flag("value_of_information", value_of_information)
+        if self.value_of_information:
+            self._planner = _with_information(self._planner, self.estimator)
 
     def __repr__(self) -> str:
         return f"Regulator({type(self.controller).__name__}, {self.estimator!r})"
@@ -216,6 +223,7 @@ class Regulator:
             measured_disturbance=v,
             limits=limits,
             manual=manual,
+            hypotheses=self.estimator.weights_of(estimate),
         )
         return decision._replace(
             state=RegulatorState(
@@ -278,6 +286,25 @@ class Regulator:
         if judged.believed.any():
             estimate = estimator.corrected(estimate, innovation, judged.believed)
         return estimate, judged, sensors
+
+
+def _with_information(planner: Controller, estimator: Estimator) -> Controller:
+    """The controller with plans that count on later data.
+
+    Raises:
+        MampcError: another controller than `MAMPC`, or an estimator that does not know its noise in output units.
+    """
+    if type(planner) is not MAMPC:
+        raise MampcError(
+            f"value_of_information: expected a controller MAMPC, received {type(planner).__name__}"
+        )
+    shifts = estimator.shifts(planner.problem.control_horizon - 1)
+    if shifts is None:
+        raise MampcError(
+            "value_of_information: expected an estimator that knows the noise in output units, such as a LoadBank, "
+            f"received {type(estimator).__name__}"
+        )
+    return planner.with_information(shifts)
 
 
 def default_estimator(problem: TrackingProblem) -> Estimator:

@@ -99,7 +99,8 @@ class PatternSolver:
             return OnPattern(None, np.inf, QPStatus.INFEASIBLE, None, 0)
         restriction = self._restriction(pattern)
         optimum = restriction.optimum(sample.target)
-        base = sample.cost + restriction.excess(sample.target) + self.admissible.charge(pattern)
+        base = sample.cost + restriction.excess(sample.target)
+        base += self.admissible.charge(pattern) + sample.forgone(pattern)
         sizes = self.admissible.min_size[pattern] if self.admissible.sized and pattern.any() else None
         lower, upper = kept = bounds[0][restriction.bounds], bounds[1][restriction.bounds]
         if within is not None:
@@ -167,7 +168,10 @@ class PatternSolver:
         moves[pattern] = chosen
         if (np.abs(chosen) < ROUNDING * self.condensed.move_prefix[pattern]).any():
             moves = without_rounding(self.condensed, sample, moves)
-            objective = self.condensed.cost(sample, moves) + self.admissible.charge(moves != 0)
+            if (
+                sample.later_data is None
+            ):  # with it the pattern counts: what later data decide may be nothing as yet
+                objective = self.condensed.cost(sample, moves) + self.admissible.charge(moves != 0)
         return OnPattern(moves, objective, QPStatus.OPTIMAL, multipliers, iterations)
 
     def offer(

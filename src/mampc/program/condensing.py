@@ -180,6 +180,11 @@ class CondensedQP:
         maps = self._constant_map if len(parameter) == self._constant_map.shape[1] else self._preview_map
         return Sample(maps.dot(parameter), self.parts, parameter, u_previous, frozen)
 
+    @property
+    def target_map(self) -> Array:
+        """The target as a map of p, shape (n_moves, size of p)."""
+        return self._target
+
     def cost(self, sample: Sample, moves: Array) -> float:
         """Tracking cost plus move weights plus output-limit penalty of the moves d, shape (n_moves,)."""
         missed = self.U.dot(moves) - sample.target

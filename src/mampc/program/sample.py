@@ -6,7 +6,7 @@ everything; the classes here are views into its result.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -70,6 +70,14 @@ class Optimum:
         return float(residual.dot(residual))
 
 
+class LaterData(Protocol):
+    """What patterns forgo of what later measurements will tell; see `moves.information`."""
+
+    def forgone(self, pattern: BoolArray) -> float: ...
+
+    def table(self, patterns: BoolArray) -> Array: ...
+
+
 class Sample(Optimum):
     """One sample's data; symbols as in `condensing`. As an `Optimum`: that with every move free.
 
@@ -78,9 +86,10 @@ class Sample(Optimum):
         u_previous: shape (m,).
         frozen: for how many samples each input may not move, whatever the rules say, shape (m,); None for none.
         bounds_now: the bounds, where they are those of this sample alone; else None.
+        later_data: what patterns forgo of later measurements, where plans count on these; else None.
     """
 
-    __slots__ = ("_constant", "bounds_now", "frozen", "parameter", "u_previous")
+    __slots__ = ("_constant", "bounds_now", "frozen", "later_data", "parameter", "u_previous")
 
     def __init__(
         self,
@@ -93,6 +102,7 @@ class Sample(Optimum):
     ) -> None:
         self.data, self.parts, self.parameter, self.u_previous = data, parts, parameter, u_previous
         self.frozen, self.bounds_now = frozen, bounds_now
+        self.later_data: LaterData | None = None
         self._margins: Array | None = None
         self._constant: float | None = None
         if bounds_now is not None:
@@ -119,6 +129,10 @@ class Sample(Optimum):
     def f_moves(self) -> Array:
         """Its entries for the moves, shape (n_moves,)."""
         return self.data[self.parts.f_moves]
+
+    def forgone(self, pattern: BoolArray) -> float:
+        """What a pattern, shape (n_moves,), forgoes of later measurements, 0 where plans do not count on these."""
+        return 0.0 if self.later_data is None else self.later_data.forgone(pattern)
 
     @property
     def constant(self) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.program.condensing import ROUNDING, CondensedQP
-from mampc.program.sample import LeastSquares, Optimum, PatternOptimum, Sample
+from mampc.program.sample import LaterData, LeastSquares, Optimum, PatternOptimum, Sample
 
 LARGEST_TABLE = 1_000_000  # entries; from here on the tree search is faster
 CACHE_BYTES = 64e6
@@ -71,13 +71,16 @@ class Ranking:
             slice(0, rows.stop) if any(past.frozen) else rows
         )  # frozen inputs may leave part of the budget unspent
 
-    def bounds(self, free: Array, least: float, past: Allowance) -> Array:
+    def bounds(
+        self, free: Array, least: float, past: Allowance, later_data: LaterData | None = None
+    ) -> Array:
         """A lower bound for each pattern of `rows`, infinite where the past forbids it.
 
         Args:
             free: the free optimum, shape (n_moves,).
             least: its cost.
             past: what the applied moves leave.
+            later_data: what patterns forgo of them, for plans that count on these.
         """
         x = free * self.condensed.lengths
         rows = self.rows(past)
@@ -86,15 +89,17 @@ class Ranking:
         values += least - len(x) * ROUNDING * float(x.dot(x))
         if self.admissible.priced:
             values += self.charge[rows]
+        if later_data is not None:
+            values += later_data.table(self.patterns)[rows]
         if self.admissible.sized:
             values += self._lift(x, rows.stop)
         if any(past.frozen):
             values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
         return values
 
-    def priced(self, cost: LeastSquares, past: Allowance) -> Array:
+    def priced(self, cost: LeastSquares, past: Allowance, later_data: LaterData | None = None) -> Array:
         """The same with the limits priced in."""
-        return self.bounds(self.condensed.plain.optimum(cost.target), cost.least, past)
+        return self.bounds(self.condensed.plain.optimum(cost.target), cost.least, past, later_data)
 
     def _lift(self, x: Array, end: int) -> Array:
         """How much more a pattern costs at least because its optimum has moves below their least size."""

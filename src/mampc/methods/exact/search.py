@@ -87,14 +87,14 @@ class ExactSearch:
         ranking = self._ranking
         if ranking is None:
             return self._search_tree(sample, past)
-        bounds = ranking.bounds(sample.moves, sample.cost, past)
+        bounds = ranking.bounds(sample.moves, sample.cost, past, sample.later_data)
         best = int(bounds.argmin())
         if not self.admissible.sized:
             at = ranking.rows(past).start + best
             optimum = ranking.optimum(at, sample)
             margins = optimum.margins
             if not len(margins) or margins[margins.argmin()] > INSIDE:
-                objective = optimum.cost + float(ranking.charge[at])
+                objective = optimum.cost + float(ranking.charge[at]) + sample.forgone(ranking.patterns[at])
                 if objective - bounds[best] <= TIE * objective:
                     return Plan(
                         optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs, objective,
@@ -112,7 +112,7 @@ class ExactSearch:
 
         def rank_again(limits: LeastSquares | None) -> None:
             if limits is not None:
-                np.maximum(bounds, ranking.priced(limits, past), out=bounds)
+                np.maximum(bounds, ranking.priced(limits, past, sample.later_data), out=bounds)
 
         rank_again(oracle.of_plain())
         solved = None

@@ -1,0 +1,108 @@
+"""What a plan's later moves gain from later measurements, and what a pattern forgoes of that.
+
+Moves planned for the sample j are chosen at the sample j, when the estimate has changed by the innovations since. An
+innovation at j shifts the estimated state and disturbances by G w, w white with variance one. With the tracking problem
+from j on, |U d - target|^2 in the moves d at j and later, it shifts the target by T G w; moves at j or later that
+the pattern S holds make up for what of it lies in the span of their columns U_S, Q an orthonormal basis of them:
+
+    forgone(S) = sum_{j=1..nc-1} |(I - Q Q') T G|^2
+
+beside a plan with every move free. As innovations are white and the pattern is fixed, the expected cost of choosing its
+later moves with later data is, limits aside, the cost of its plan and forgone(S), but for a constant that all patterns
+share. It is a sum of squares and falls with every move that a pattern gains, so that it is a price as any other.
+
+Hypotheses about the loads have a G each; their weights mix what is forgone under each.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray
+from mampc.base.errors import MampcWarning
+from mampc.program.condensing import CondensedQP
+from mampc.program.problem import Limits, TrackingProblem
+
+
+class Information:
+    """What every pattern forgoes; see the module.
+
+    Args:
+        problem: the tracking problem.
+        shifts: G of each hypothesis and each of the samples 1 .. nc - 1, of (x, d_u, d_y),
+            shape (B, nc - 1, n + m + l, l).
+    """
+
+    def __init__(self, problem: TrackingProblem, shifts: Array) -> None:
+        self._m, self.hypotheses = problem.model.n_inputs, len(shifts)
+        self._later: list[tuple[Array, Array]] = []  # U, and T G of all hypotheses side by side
+        for j in range(1, problem.control_horizon):
+            from_then_on = replace(
+                problem, prediction_horizon=problem.prediction_horizon - j,
+                control_horizon=problem.control_horizon - j, limits=Limits(), weigh_first_move=True,
+            )  # fmt: skip
+            with warnings.catch_warnings():  # the whole problem has warned of its condition
+                warnings.simplefilter("ignore", MampcWarning)
+                condensed = CondensedQP(from_then_on)
+            target = condensed.target_map
+            place = condensed.parameter
+            of_estimate = np.hstack(
+                [target[:, place.x], target[:, place.input_disturbance], target[:, place.output_disturbance]]
+            )
+            shifted = np.matmul(of_estimate, shifts[:, j - 1])  # (B, moves, l)
+            self._later.append((condensed.U, shifted.swapaxes(0, 1).reshape(len(of_estimate), -1)))
+        self._known: dict[tuple[int, bytes], Array] = {}
+        self._tables: dict[int, tuple[BoolArray, Array]] = {}
+
+    def forgone(self, pattern: BoolArray) -> Array:
+        """Of a pattern, shape (n_moves,), under each hypothesis, shape (B,)."""
+        total = np.zeros(self.hypotheses)
+        for j in range(len(self._later)):
+            later = pattern[(j + 1) * self._m :]
+            key = j, later.tobytes()
+            known = self._known.get(key)
+            if known is None:
+                known = self._known[key] = self._missed(j, later)
+            total += known
+        return total
+
+    def table(self, patterns: BoolArray) -> Array:
+        """Of many patterns (K, n_moves), which are kept as they are, shape (K, B)."""
+        known = self._tables.get(id(patterns))
+        if known is None:
+            rows = np.array([self.forgone(pattern) for pattern in patterns])
+            known = self._tables[id(patterns)] = patterns, rows
+        return known[1]
+
+    def at(self, weights: Array) -> InformationNow:
+        """With these weights of the hypotheses, shape (B,)."""
+        return InformationNow(self, weights)
+
+    def _missed(self, j: int, pattern: BoolArray) -> Array:
+        U, shifted = self._later[j]
+        if pattern.all():
+            return np.zeros(self.hypotheses)
+        Q = np.linalg.qr(U[:, pattern], mode="complete")[0]
+        missed = Q[:, int(pattern.sum()) :].T @ shifted
+        each: Array = np.square(missed).sum(axis=0).reshape(self.hypotheses, -1).sum(axis=1)
+        return each
+
+
+class InformationNow(NamedTuple):
+    """`Information` with the weights of one sample, shape (B,)."""
+
+    information: Information
+    weights: Array
+
+    def forgone(self, pattern: BoolArray) -> float:
+        """By a pattern, shape (n_moves,)."""
+        return float(self.information.forgone(pattern).dot(self.weights))
+
+    def table(self, patterns: BoolArray) -> Array:
+        """By patterns (K, n_moves), shape (K,)."""
+        table: Array = self.information.table(patterns).dot(self.weights)
+        return table
