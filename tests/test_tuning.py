@@ -16,8 +16,7 @@ from mampc.study.running import run_study
 from mampc.study.writing import study_text
 
 SMALL = {
-    "SEARCHED": 3, "REFINED": 4, "CONFIRMED": 6, "SEARCH_PRICES": 3, "REFINE_PRICES": 4, "DRIFTS": (0.3,),
-    "MOVE_WEIGHTS": (0.1,),
+    "SEARCHED": 3, "REFINED": 4, "CONFIRMED": 6, "SEARCH_PRICES": 3, "REFINE_PRICES": 4, "MOVE_WEIGHTS": (0.1,),
 }  # fmt: skip
 
 

@@ -79,10 +79,10 @@ def study_of_model(model: StateSpace, tuned: Tuned, name: str) -> Study:
 def with_tuning(study: Study, tuned: Tuned) -> Study:
     """A study with the problem, the estimator and the controller found, and plain MPC beside it."""
     changed: dict[str, Any] = {"identification": None, "model": ModelTable(file=MODEL_FILE)}
-    if not np.isfinite(tuned.drift):  # plain MPC
+    if tuned.is_plain:
         return study.model_copy(update=changed | {"controllers": [BASELINE]})
     estimator = EstimatorTable(
-        measurement_noise=tuned.noise.tolist(), drift=(tuned.drift * tuned.noise).tolist()
+        kind="load_bank", value_of_information=True, measurement_noise=tuned.noise.tolist()
     )
     controllers = [
         ControllerTable(name="tuned", method="exact", rules=RulesTable(price=tuned.rules.price)),

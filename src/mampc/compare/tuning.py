@@ -1,7 +1,8 @@
 """One knob: the controller with the fewest moves at an error that one allows, found on stand-ins for the plant.
 
-A few candidates (how fast the estimator follows loads, move weight, tail) are run over a grid of prices; the best go on
-with more prices in fresh scenarios; the best of these is confirmed in scenarios that nothing was chosen by.
+Every candidate has a load bank for an estimator and counts on later data; they differ in move weight and tail. They are
+run over a grid of prices; the best go on with more prices in fresh scenarios; the best of these is confirmed in
+scenarios that nothing was chosen by.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from mampc.base.progress import watched
 from mampc.compare.fronts import FEWEST, Estimate, Point, non_dominated
 from mampc.compare.scenarios import Scenarios, Surroundings, usual_problem
 from mampc.controllers import MAMPC, MPC
-from mampc.loop.estimation import KalmanFilter
+from mampc.loop.estimation import Estimator, KalmanFilter
+from mampc.loop.load_bank import LoadBank
 from mampc.loop.regulator import Regulator
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.state_space import StateSpace
 
-DRIFTS = (0.1, 0.3, 1.0)  # of the loads that an estimator expects, times the noise
 MOVE_WEIGHTS = (0.03, 0.3)  # times those of plain MPC
 CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
 MOST_MOVES = (
@@ -48,25 +49,17 @@ class Candidate:
     Attributes:
         name: in tables.
         problem: what it solves.
-        drift: of its estimator, times the noise.
-        noise: that its estimator expects, shape (l,).
+        estimator: with the noise that it expects.
     """
 
     name: str
     problem: TrackingProblem
-    drift: float
-    noise: Array
-
-    @property
-    def estimator(self) -> KalmanFilter:
-        """Its Kalman filter."""
-        return KalmanFilter.offset_free(
-            self.problem.model, measurement_noise=self.noise, drift=self.drift * self.noise
-        )
+    estimator: LoadBank
 
     def regulator(self, price: float) -> Regulator:
         """It, with a price."""
-        return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.estimator)
+        controller = MAMPC(self.problem, MoveRules(price=price))
+        return Regulator(controller, self.estimator, value_of_information=True)
 
     def points(self, prices: Sequence[float], scenarios: Scenarios) -> list[Point]:
         """Its moves and errors in every scenario, price by price."""
@@ -184,7 +177,7 @@ class Tuned:
         reached: whether what was asked for is kept by fewer moves than those of plain MPC.
         baseline: plain MPC, which errors are compared with.
         noise: of the outputs, shape (l,), as assumed or told.
-        drift: that the estimator expects, times the noise.
+        estimator: of the controller.
         loads: of the scenarios, which took them in turn.
         rows: every run of the second round, as a sweep writes them.
     """
@@ -196,7 +189,7 @@ class Tuned:
     reached: bool
     baseline: Regulator = field(repr=False)
     noise: Array = field(repr=False)
-    drift: float = field(repr=False)
+    estimator: Estimator = field(repr=False)
     loads: tuple[Any, ...] = field(repr=False)
     rows: list[dict[str, Any]] = field(repr=False)
 
@@ -207,12 +200,13 @@ class Tuned:
 
     def at_price(self, price: float) -> Regulator:
         """The same with another price; 0 for none."""
-        if self._is_plain:
-            return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.baseline.estimator)
-        return Candidate("", self.problem, self.drift, self.noise).regulator(price)
+        if isinstance(self.estimator, LoadBank) and not self.is_plain:
+            return Candidate("", self.problem, self.estimator).regulator(price)
+        return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.estimator)
 
     @property
-    def _is_plain(self) -> bool:
+    def is_plain(self) -> bool:
+        """Whether nothing better than plain MPC was found."""
         return self.problem is self.baseline.controller.problem
 
 
@@ -313,7 +307,7 @@ def tune(
         front = _front(own, base, second.hours)
     return Tuned(
         problem if chosen is None else chosen.problem, MoveRules(price=price), expected, front, reached, plain,
-        around.noise, np.nan if chosen is None else chosen.drift, around.loads, rows,
+        around.noise, plain.estimator if chosen is None else chosen.estimator, around.loads, rows,
     )  # fmt: skip
 
 
@@ -352,24 +346,20 @@ def candidates(problem: TrackingProblem, noise: Array) -> list[Candidate]:
     """All that are compared, for a problem of plain MPC."""
     m, n_p = problem.model.n_inputs, problem.prediction_horizon
     n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
-    found = []
+    estimator, found = LoadBank(problem.model, noise=noise), []
     for share in MOVE_WEIGHTS:
         for tail in (0, n_p):
             sparse = replace(
                 problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail
             )
-            for drift in DRIFTS:
-                name = f"drift {drift:g}, move weight x {share:g}, tail {tail}"
-                candidate = Candidate(name, sparse, drift, noise)
-                try:
-                    candidate.regulator(1.0)
-                except MampcError:  # such as a tail that an unstable model does not have
-                    continue
-                found.append(candidate)
+            candidate = Candidate(f"move weight x {share:g}, tail {tail}", sparse, estimator)
+            try:
+                candidate.regulator(1.0)
+            except MampcError:  # such as a tail that an unstable model does not have
+                continue
+            found.append(candidate)
     if not found:
-        raise MampcError(
-            "tune: expected a model that a sparse controller and a Kalman filter can be built for"
-        )
+        raise MampcError("tune: expected a model that a sparse controller can be built for")
     return found
 
 

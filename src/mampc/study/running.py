@@ -15,7 +15,8 @@ from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.loop.batch import Batch, simulate_batch
-from mampc.loop.estimation import KalmanFilter
+from mampc.loop.estimation import Estimator, KalmanFilter
+from mampc.loop.load_bank import LoadBank
 from mampc.loop.loads import Load, Residuals
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
@@ -141,10 +142,14 @@ def prepare(
 
 def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
     """The regulator that a study's tables describe."""
-    controller, estimator = _controller(_problem(study, model), table), _estimator(study, model)
+    problem = _problem(study, model)
+    controller, estimator = _controller(problem, table), _estimator(study, problem)
+    counts = study.estimator.value_of_information and type(controller) is MAMPC
     smooth = None if table.reference_filter is None else table.reference_filter.made()
     try:
-        return Regulator(controller, estimator, reference_filter=smooth, **_sensors(study))
+        return Regulator(
+            controller, estimator, reference_filter=smooth, value_of_information=counts, **_sensors(study)
+        )
     except MampcError as error:
         raise StudyError(f"controllers, {table.name!r}, reference_filter: {error}") from None
 
@@ -306,9 +311,13 @@ def _sparse(problem: TrackingProblem, table: ControllerTable, method: str, setti
     )  # fmt: skip
 
 
-def _estimator(study: Study, model: StateSpace) -> KalmanFilter:
+def _estimator(study: Study, problem: TrackingProblem) -> Estimator:
+    table = study.estimator
     try:
-        return KalmanFilter.offset_free(model, **study.estimator.model_dump())
+        if table.kind == "load_bank":
+            return LoadBank.for_problem(problem, noise=table.measurement_noise)
+        settings = table.model_dump(exclude={"kind", "value_of_information"})
+        return KalmanFilter.offset_free(problem.model, **settings)
     except MampcError as error:
         raise StudyError(f"[estimator] {error}") from None
 

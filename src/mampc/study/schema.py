@@ -336,10 +336,24 @@ class ControllerTable(Table):
 
 
 class EstimatorTable(Table):
+    kind: Literal["kalman_filter", "load_bank"] = "kalman_filter"
+    value_of_information: bool = False
     disturbance: Literal["auto", "output", "input"] = "auto"
     measurement_noise: Values | None = None
     drift: Values | None = None
     input_noise: Values | None = None
+
+    @model_validator(mode="after")
+    def _settings_of_the_kind(self) -> EstimatorTable:
+        if self.kind == "load_bank":
+            other = {"disturbance", "drift", "input_noise"} & self.model_fields_set
+            if other:
+                raise ValueError(
+                    f"neither disturbance, drift nor input_noise for a load_bank; received {', '.join(sorted(other))}"
+                )
+        elif self.value_of_information:
+            raise ValueError('value_of_information with kind = "load_bank" only, which knows the noise')
+        return self
 
 
 class SensorsTable(Table):
