@@ -1,22 +1,36 @@
 """The command line: what it prints, writes, refuses and returns."""
 
+import io
 import json
 import signal
 import subprocess
 import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import mampc
+from mampc.cli import main
 from mampc.study import template
 
 
+class Done(NamedTuple):
+    returncode: int
+    stdout: str
+    stderr: str
+
+
 def call(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-c", "from mampc.cli import main; main()", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    """What the command says and returns; in this process, since a new one would spend its time on imports."""
+    out, err, handler = io.StringIO(), io.StringIO(), signal.getsignal(signal.SIGINT)
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err), chdir(cwd):
+        patch.setattr(sys, "argv", ["mampc", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    signal.signal(signal.SIGINT, handler)
+    return Done(ended.value.code or 0, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +125,15 @@ def test_help_shows_how(command, tmp_path):
     assert done.returncode == 0
     if command:
         assert f"mampc {command[0]} " in done.stdout.split("Example", 1)[1]
+
+
+def test_a_process_of_its_own_complains_alike(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "mampc", "run", "no-such-study"], cwd=tmp_path, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    here = call("run", "no-such-study", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (2, here.stdout, here.stderr)
 
 
 def test_the_readme_example_runs(tmp_path):

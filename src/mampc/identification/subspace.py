@@ -56,6 +56,7 @@ def supported_order(correlations: Array, columns: int, m: int, l: int, s: int) -
         columns: Hankel columns less those that the future inputs take up.
         m, l, s: numbers of inputs, outputs and block rows.
     """
+    columns = max(columns, 1)  # with none left, everything may be chance
     past, future = min(1.0, s * (m + l) / columns), min(1.0, s * l / columns)
     edge = np.sqrt(past * (1 - future)) + np.sqrt(future * (1 - past))
     counted = int(np.count_nonzero(correlations > edge if past + future < 1 else correlations > 1.0))
