@@ -97,7 +97,16 @@ def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, outp
         np.einsum("ia,ab,ib", error, problem.output_weight, error)
         + np.einsum("ja,ab,jb", weighed, problem.move_weight, weighed)
         + problem.output_limit_weight * np.sum(scaled + scaled**2 / 2)
+        + cost_of_inputs(problem, plan[np.minimum(np.arange(n_p + 1), len(plan) - 1)])
     )
+
+
+def cost_of_inputs(problem, u):
+    """What inputs (T, m) cost where they are, as `TrackingProblem` states it."""
+    c, limits = problem.u_cost, problem.limits
+    cheapest = np.where(c > 0, limits.u_min, np.where(c < 0, limits.u_max, 0.0))
+    apart = u - (0.0 if problem.u_target is None else problem.u_target)
+    return np.einsum("ia,ab,ib", apart, problem.u_target_weight, apart) + np.sum((u - cheapest) @ c)
 
 
 def same_decision(a, b, atol=1e-12):

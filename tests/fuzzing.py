@@ -108,6 +108,15 @@ def limits(draw, model, scale):
 
 
 @st.composite
+def input_costs(draw, limits, model):
+    """Costs of inputs, towards limits that there are."""
+    checked = limits.checked(model.n_inputs, model.n_outputs)
+    costs = [draw(st.sampled_from([0.0, 0.0, 0.01, -1.0])) for _ in range(model.n_inputs)]
+    sides = zip(costs, checked.u_min, checked.u_max, strict=True)
+    return [cost if np.isfinite(low if cost > 0 else high) else 0.0 for cost, low, high in sides]
+
+
+@st.composite
 def move_rules(draw, n_c):
     """Move rules in any combination; least sizes that fit the limits are drawn with these."""
     return {
@@ -131,6 +140,7 @@ def loops(draw):
         output_weight=1 / scale**2, move_weight=draw(st.sampled_from([0.01, 0.1, 1.0])), limits=told,
         tail_horizon=draw(st.sampled_from([0.0, 0.0, 2.0])),
         output_limit_weight=draw(st.sampled_from([1e2, 1e4])),
+        u_target_weight=draw(st.sampled_from([0.0, 0.0, 1e-3, 0.1])), u_cost=draw(input_costs(told, model)),
     )  # fmt: skip
     rules, method, settings = None, draw(st.sampled_from(["mpc", "alternating", "exact", *SPARSE])), {}
     if method != "mpc":

@@ -8,7 +8,7 @@ import numpy as np
 import pyscipopt
 from scipy import sparse
 
-from builders import cost_of, fading, predicted, violation_scale
+from builders import cost_of, cost_of_inputs, fading, predicted, violation_scale
 
 TINY = 1e-9  # changes below are rounding
 
@@ -99,6 +99,13 @@ def program_of(problem, x, u_previous, reference):
     H[:l, :l] = w * np.eye(l)
     H[l:, l:] = 2 * (theta.T @ Q @ theta + R)
     f = np.concatenate([np.full(l, w), -2 * theta.T @ Q @ error])
+    samples = np.minimum(np.arange(n_p + 1), n_c - 1)
+    held = np.tile(u_previous, (n_p + 1, 1))
+    over_horizon = to_inputs.reshape(n_c, m, n)[samples].reshape(-1, n)
+    W = np.kron(np.eye(n_p + 1), problem.u_target_weight)
+    apart = held.ravel() - np.tile(np.zeros(m) if problem.u_target is None else problem.u_target, n_p + 1)
+    H[l:, l:] += 2 * over_horizon.T @ W @ over_horizon
+    f[l:] += over_horizon.T @ (2 * W @ apart + np.tile(problem.u_cost, n_p + 1))
     none, violation = np.zeros((n, l)), np.kron(fading(n_p)[:, None], np.diag(1 / scale))
     rows = np.block([
         [none, to_inputs], [none, -to_inputs], [none, np.eye(n)], [none, -np.eye(n)],
@@ -111,7 +118,8 @@ def program_of(problem, x, u_previous, reference):
         np.tile(limits.y_max, n_p) - predicted_free, predicted_free - np.tile(limits.y_min, n_p), np.zeros(l),
     ])  # fmt: skip
     limited = np.isfinite(bounds)
-    return Program(H, f, float(error @ Q @ error), rows[limited], bounds[limited])
+    constant = float(error @ Q @ error) + cost_of_inputs(problem, held)
+    return Program(H, f, constant, rows[limited], bounds[limited])
 
 
 def best_on(program, pattern, n_violations, at_least=None, at_most=None):

@@ -1,13 +1,14 @@
 """Whatever a decision came from: its plan, changes, moves and objective are of one and the same plan."""
 
 from collections import Counter
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 import mampc
-from builders import fading, predicted, random_model, violation_scale
+from builders import cost_of_inputs, fading, predicted, random_model, violation_scale
 from mampc import Remark
 from referees import charge
 
@@ -57,6 +58,7 @@ def random_controller(seed, method):
         tail_horizon=float(rng.choice([0.0, 0.0, 3.0])), weigh_first_move=m > 1 or rng.random() < 0.5,
         output_limit_weight=float(rng.choice([10.0, 1e4])),
     )  # fmt: skip
+    problem = with_input_cost(np.random.default_rng([seed, 1]), problem)
     rules = random_rules(rng)
     if method == "mpc":
         return rng, mampc.MPC(problem), mampc.MoveRules()
@@ -67,6 +69,22 @@ def random_controller(seed, method):
     urgent = str(rng.choice(["keep_budget", "ignore_budget"]))
     settings = SETTINGS.get(method, {})
     return rng, mampc.MAMPC(problem, rules, method=name, on_limit_violation=urgent, **settings), rules
+
+
+def with_input_cost(rng, problem):
+    """The problem, and as often as not with targets for its inputs or costs where a limit is."""
+    limits, m = problem.limits, problem.model.n_inputs
+    target = {}
+    if rng.random() < 0.3:
+        target = {
+            "u_target": problem.model.u_op + rng.uniform(-1, 1, m),
+            "u_target_weight": rng.choice([1e-3, 0.1]),
+        }
+    cost = np.zeros(m)
+    if rng.random() < 0.3:
+        cost = rng.choice([1e-3, 0.1]) * rng.uniform(-1, 1, m)
+        cost[(cost > 0) & np.isinf(limits.u_min) | (cost < 0) & np.isinf(limits.u_max)] = 0.0
+    return replace(problem, u_cost=cost, **target)
 
 
 def limits_now(rng, problem):
@@ -134,6 +152,8 @@ def cost_of(problem, x, u_previous, reference, plan, limits, input_disturbance, 
         np.einsum("i,ia,ab,ib", weight, error, problem.output_weight, error)
         + np.einsum("ja,ab,jb", weighed, problem.move_weight, weighed)
         + problem.output_limit_weight * np.sum(scaled + scaled**2 / 2)
+        + cost_of_inputs(problem, plan[np.minimum(np.arange(n_p + 1), len(plan) - 1)])
+        + L * cost_of_inputs(problem, plan[-1:])
     ), excess.max(axis=0)
 
 

@@ -31,3 +31,14 @@ def test_filtered_references_need_smaller_moves(found):
     runs = found("reference-filter")["noise-free"]
     assert (largest_move(runs["MPC with a ramp"]) < largest_move(runs["MPC"]) / 3).all()
     assert (largest_move(runs["price with a lag"]) < largest_move(runs["price"]) / 2).all()
+
+
+def test_the_small_valve_returns_to_its_resting_value(found):
+    runs = found("resting-values")["with a load"]
+    for run in runs.values():
+        for changed in (120, 180):  # just before the next change
+            assert run.u[changed - 1, 1] == pytest.approx(50.0, abs=3.0)
+            assert run.y[changed - 10 : changed].mean() == pytest.approx(run.r[changed - 1, 0], abs=0.7)
+    assert runs["MPC"].u[12, 1] > 55.0  # it helps while it is needed
+    moves = {name: run.metrics(threshold=0.1).moves.sum() for name, run in runs.items()}
+    assert moves["price"] < 0.1 * moves["MPC"]

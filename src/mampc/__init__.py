@@ -10,6 +10,7 @@ from mampc.base.words import Fault, LoadKind, Remark, Status
 from mampc.compare.tuning import Tuned, tune
 from mampc.controllers import MAMPC, MPC, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
+from mampc.controllers.targets import Targets, targets
 from mampc.identification import Export, Identified, IOData, Validation, excite, n4sid, read_export, validate
 from mampc.loop import loads
 from mampc.loop.batch import Batch, simulate_batch
@@ -88,6 +89,7 @@ __all__ = [
     "StateSpace",
     "Status",
     "StudyError",
+    "Targets",
     "TrackingProblem",
     "Tuned",
     "Validation",
@@ -105,6 +107,7 @@ __all__ = [
     "simulate",
     "simulate_batch",
     "steps",
+    "targets",
     "tune",
     "validate",
 ]

@@ -36,15 +36,15 @@ def tie(objective: float, rounding: float = 0.0) -> float:
     """How near two objectives are that are equally good: TIE, or what rounding leaves open.
 
     Args:
-        objective: a sum of squares, not negative.
+        objective: a sum of squares, or priced inputs beyond their limits, which may cost less than nothing.
         rounding: of the length whose square it is.
     """
-    return TIE * objective + left_open(objective, rounding) if objective < float("inf") else 0.0
+    return TIE * abs(objective) + left_open(objective, rounding) if objective < float("inf") else 0.0
 
 
 def left_open(objective: float, rounding: float) -> float:
     """How far an objective may be from the truth, a sum of squares whose root is known to within `rounding`."""
-    return (2 * sqrt(objective) + rounding) * rounding
+    return (2 * sqrt(max(objective, 0.0)) + rounding) * rounding
 
 
 def prefix(curvature: Array, width: Array) -> Array:

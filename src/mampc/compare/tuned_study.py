@@ -130,6 +130,8 @@ def _problem(tuned: Tuned) -> ProblemTable:
         output_weight=_weight(problem.output_weight), move_weight=_weight(problem.move_weight),
         limits=LimitsTable(**limits), weigh_first_move=problem.weigh_first_move,
         output_limit_weight=problem.output_limit_weight, tail_horizon=problem.tail_horizon,
+        u_target=None if problem.u_target is None else problem.u_target.tolist(),
+        u_target_weight=_weight(problem.u_target_weight), u_cost=problem.u_cost.tolist(),
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import warnings
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from mampc.base.checks import Array, BoolArray, ComplexArray
 from mampc.base.errors import MampcError, MampcWarning
 from mampc.base.tolerances import prefix
 from mampc.program.bounds import Bounds
+from mampc.program.input_cost import distance_from_targets, price_of_inputs
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
@@ -61,7 +63,8 @@ class CondensedQP:
         bounds: which quantities are bounded, and between what.
         theta: predicted outputs per move, shape ((np + 1) l, n_moves).
         cumulate: u_j - u_prev per move, shape (n_moves, n_moves).
-        weighted_theta: Q^(1/2) theta, and below it the weighted tail's rows, shape (n_errors, n_moves).
+        weighted_theta: Q^(1/2) theta, and below it the rows of the weighted tail and of targets for inputs, shape
+            (n_errors, n_moves).
         error_of_reference: what a constant reference adds to the error, shape (n_errors, l).
         map_bytes: about the memory that an `optimum_on` some pattern takes.
 
@@ -96,6 +99,10 @@ class CondensedQP:
             tail_error, tail_theta = tail(problem, prediction, parameter)
             self._error = np.vstack([self._error, tail_error])
             self.weighted_theta = np.vstack([self.weighted_theta, tail_theta])
+        if problem.u_target is not None:
+            from_targets, per_move = distance_from_targets(problem, parameter)
+            self._error = np.vstack([self._error, from_targets])
+            self.weighted_theta = np.vstack([self.weighted_theta, per_move])
         self.R = np.kron(np.eye(n_c), problem.move_weight)
         if not problem.weigh_first_move:
             self.R[:m, :m] = 0.0
@@ -131,6 +138,8 @@ class CondensedQP:
             of_error.shape[1]: np.linalg.norm(of_error, axis=0)
             for of_error in (self._error, parameter.with_constant_reference(self._error))
         }
+        for lengths in self._error_lengths.values():
+            lengths[parameter.one] += self._shift
         self.error_of_reference = parameter.with_constant_reference(self._error)[:, parameter.one.stop :]
 
     def _triangularise(self) -> None:
@@ -151,6 +160,22 @@ class CondensedQP:
         lost = Q.T @ rest  # what rounding left in the range of W
         self._target += lost
         self._free_residual: Array = np.asarray(np.linalg.qr(rest - Q @ lost, mode="r"))
+        self._price: Array | None = None
+        self._shift = 0.0
+        if self.problem.u_cost.any():
+            self._price_inputs()
+
+    def _price_inputs(self) -> None:
+        """A linear cost g'd + held: a shift D of the target, and what this costs beside squares, which is affine in p.
+
+        |U d - t|^2 + g'd + held = |U d - t - D|^2 - 2 D't - |D|^2 + held,    D = -1/2 U^-T g
+        """
+        per_move, held = price_of_inputs(self.problem, self.parameter)
+        D, one = -0.5 * np.linalg.solve(self.U.T, per_move), self.parameter.one.start
+        held = held - 2 * (D @ self._target)
+        held[one] -= D @ D
+        self._target[:, one] += D
+        self._price, self._shift = held[None], float(np.linalg.norm(D))
 
     def _growth(self, n: int, l: int) -> float:
         """How many times larger the outputs that a state predicts become than over the first n + 1 samples."""
@@ -163,7 +188,8 @@ class CondensedQP:
         moves, kept = self.parameter.no_map(self.n_moves), restriction.bounds[self.n_violations :]
         chosen = moves[restriction.moves] = restriction.optimum(self._target)
         at_optimum, lower, upper = restriction.rows @ chosen, self.bounds.lower[kept], self.bounds.upper[kept]
-        return {
+        price = {} if self._price is None else {"price": self._price}
+        return price | {
             "margins": np.concatenate([at_optimum - lower, upper - at_optimum]),
             "moves": moves,
             "inputs": self._u_previous + self.cumulate @ moves,
@@ -257,10 +283,15 @@ class CondensedQP:
 
 def _stacked(**maps: Array) -> tuple[Array, Parts]:
     """The affine maps in one matrix, and where each stands in it; f_moves is the end of f."""
-    at, start = {}, 0
+    at: dict[str, Any] = {}
+    start = 0
     for name, rows in maps.items():
         if name == "f_moves":
             at[name] = slice(start - len(rows), start)
+            continue
+        if name == "price":
+            at[name] = start
+            start += 1
             continue
         at[name] = slice(start, start + len(rows))
         start += len(rows)

@@ -23,7 +23,7 @@ from mampc.program.refinement import refined
 
 SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
 UNCERTAIN = 1e-10  # of the excess: what a solver's slack may be worth before the solution is refined
-DOUBTFUL = 1e4  # condition of R from which on what a solver calls infeasible is looked at again
+DOUBTFUL = 1e4  # condition of R from which on the slack that a solver leaves is looked at
 MOST_ROUNDS = 100  # of a refinement
 
 
@@ -98,7 +98,7 @@ class LeastDistance:
         solution = self._solver.solve(f, low, high)
         z, pull, status, iterations = solution
         if z is None or pull is None:
-            if status in (QPStatus.INFEASIBLE, QPStatus.FAILED, QPStatus.ITERATION_LIMIT) and self._doubtful:
+            if status in (QPStatus.INFEASIBLE, QPStatus.FAILED, QPStatus.ITERATION_LIMIT):
                 return self._tried_again(optimum, lower, upper, solution)
             return Nearest(None, np.inf, None, status, iterations)
         delta = z[v:] * scale
@@ -125,7 +125,7 @@ class LeastDistance:
 
     @cached_property
     def _doubtful(self) -> bool:
-        """Whether a solver may fail for the condition of R, though there are moves within bounds."""
+        """Whether a solver may spoil the optimum by its slack, for the condition of R."""
         length = np.linalg.norm(self._R, axis=0)
         return bool(len(length) and np.linalg.cond(self._R / length) > DOUBTFUL)
 
@@ -137,7 +137,10 @@ class LeastDistance:
         return DaqpSolver(QuadraticProgram(np.eye(v + k), A, v))
 
     def _tried_again(self, optimum: Array, lower: Array, upper: Array, failed: QPSolution) -> Nearest:
-        """What a solver failed at, from no active bounds on; INFEASIBLE only if there are no moves within bounds."""
+        """What a solver failed at, from no active bounds on; INFEASIBLE only if there are no moves within bounds.
+
+        Where bounds leave a move one value, rounding alone makes a tight tolerance fail.
+        """
         self._in_moves.start()
         if self._in_moves.solve(np.zeros(len(self._f)), lower, upper).status is QPStatus.INFEASIBLE:
             return Nearest(None, np.inf, None, QPStatus.INFEASIBLE, failed.iterations)

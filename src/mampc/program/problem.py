@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import as_limit, as_number, as_weight, as_whole
+from mampc.base.checks import as_limit, as_number, as_vector, as_weight, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.systems.state_space import StateSpace
 
@@ -76,6 +76,7 @@ class TrackingProblem:
     """Track references with a linear model over a receding horizon (the paper's eqs. 1 to 3).
 
         minimise   sum_{i=0..np} |r_i - y_i|^2_Q + sum_{j=0..nc-1} |du_j|^2_R + penalty(y limits) [+ tail]
+                   [+ sum_{i=0..np} |u_i - u_target|^2_W + c' u_i, with its own tail]
         subject to u_min <= u_j <= u_max, |du_j| <= du_max     j = 0..nc-1
                    y_min - rho_i e <= y_i <= y_max + rho_i e   i = 1..np
 
@@ -97,6 +98,12 @@ class TrackingProblem:
         tail_horizon: L >= 0, in samples. Beyond the prediction horizon, inputs held, errors go on to count,
             weighted gamma, gamma^2, ... with gamma = L / (1 + L), so that an error that stays costs L
             samples more. With prices it decides how long an offset is looked at (see docs/methods.md).
+        u_target: values that inputs rest at where tracking leaves them free, a scalar or one per input; default the
+            operating point.
+        u_target_weight: W; a scalar, one value per input, or an (m, m) matrix. Small against tracking, for what it
+            weighs against Q an output's offset pays for. Inputs count on in the tail, L samples at their last value.
+        u_cost: c, the cost of a unit of each input at each sample, a scalar or one per input, counted from the limit
+            towards which it pulls: u_min where positive, u_max where negative, which has to be there.
 
     Raises:
         MampcError: anything that does not fit the model or the horizons.
@@ -111,6 +118,9 @@ class TrackingProblem:
     weigh_first_move: bool = field(default=True, kw_only=True)
     output_limit_weight: float = field(default=1e4, kw_only=True)
     tail_horizon: float = field(default=0.0, kw_only=True)
+    u_target: Any = field(default=None, kw_only=True)
+    u_target_weight: Any = field(default=0.0, kw_only=True)
+    u_cost: Any = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, StateSpace):
@@ -147,10 +157,37 @@ class TrackingProblem:
             "limits": self.limits.checked(m, l),
             "output_limit_weight": weight,
             "tail_horizon": as_number("tail_horizon", self.tail_horizon, 0.0),
+            "u_target_weight": as_weight("u_target_weight", self.u_target_weight, m),
+            "u_target": None if self.u_target is None else as_vector("u_target", self.u_target, m),
+            "u_cost": as_vector("u_cost", self.u_cost, m),
         }.items():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
             object.__setattr__(self, name, value)
+        self._check_input_cost()
+        for array in vars(self).values():
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+
+    def _check_input_cost(self) -> None:
+        weighted = bool(self.u_target_weight.any())
+        if self.u_target is None and weighted:
+            object.__setattr__(self, "u_target", self.model.u_op.copy())
+        if self.u_target is not None and not weighted:
+            raise MampcError(
+                "u_target: expected a u_target_weight above zero beside it, which says what a distance from the "
+                f"target costs, received {shown(self.u_target.tolist())} without"
+            )
+        for side, pulled in (("u_min", self.u_cost > 0), ("u_max", self.u_cost < 0)):
+            limit = getattr(self.limits, side)
+            if not np.isfinite(limit[pulled]).all():
+                raise MampcError(
+                    f"u_cost: expected a finite {side} of every input that it pulls there, received u_cost "
+                    f"{self.u_cost} and {side} {limit}"
+                )
+
+    @property
+    def prices_inputs(self) -> bool:
+        """Whether inputs cost something where they are, by a target or a price."""
+        return bool(self.u_target_weight.any() or self.u_cost.any())
 
     def __repr__(self) -> str:
         """One line; weights and limits of many signals in short."""
@@ -162,4 +199,7 @@ class TrackingProblem:
         for name in ("weigh_first_move", "output_limit_weight", "tail_horizon"):
             value, usual = values[name]
             told += [f"{name}={value!r}"] if value != usual else []
+        if self.u_target is not None:
+            told += [f"{name}={_short(getattr(self, name))}" for name in ("u_target", "u_target_weight")]
+        told += [f"u_cost={_short(self.u_cost)}"] if self.u_cost.any() else []
         return f"TrackingProblem({', '.join(told)})"

@@ -28,6 +28,7 @@ class Parts(NamedTuple):
     f_moves: slice = slice(0)
     lower: slice = slice(0)
     upper: slice = slice(0)
+    price: int | None = None  # what inputs cost that are priced per unit, beside the squares of the residual
 
 
 class LeastSquares(NamedTuple):
@@ -44,7 +45,7 @@ class Optimum:
     """One sample's optimum without limits on some pattern, as views into one array.
 
     How far it stays from each bound (negative where it breaks one), its moves d, its inputs
-    u_0 .. u_{nc-1}, and a vector whose squared length is its cost.
+    u_0 .. u_{nc-1}, and a vector whose squared length is its cost (where inputs have a price, up to one number).
     """
 
     __slots__ = ("_margins", "data", "parts")
@@ -66,8 +67,9 @@ class Optimum:
 
     @property
     def cost(self) -> float:
-        residual = self.data[self.parts.residual]
-        return float(residual.dot(residual))
+        residual, price = self.data[self.parts.residual], self.parts.price
+        cost = float(residual.dot(residual))
+        return cost if price is None else cost + float(self.data[price])
 
 
 class LaterData(Protocol):

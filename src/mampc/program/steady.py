@@ -33,31 +33,48 @@ class Steady(NamedTuple):
     y: Array
 
 
+class SteadyStates:
+    """All steady states (x / size, (u - u_op) / unit) of a problem's model.
+
+    Attributes:
+        unit: of each input, shape (m,): it moves the weighted outputs by about 1 over the horizon.
+        size: of each state, shape (n,), which makes the model's numbers alike.
+        basis: without disturbances all are combinations of these columns, shape (n + m, k).
+    """
+
+    def __init__(self, problem: TrackingProblem) -> None:
+        from scipy.linalg import matrix_balance, null_space
+
+        model = problem.model
+        n, m = model.n_states, model.n_inputs
+        response = model.step_response(problem.prediction_horizon + 1)[:, :, :m]
+        gain = np.abs(square_root(problem.output_weight) @ response).max(axis=(0, 1))
+        self.unit: Array = 1 / np.where(gain > 0, gain, 1.0)
+        # In units that make the model's numbers alike a small singular value is an integrator.
+        _, (self.size, _) = matrix_balance(model.A, permute=False, separate=True)
+        dynamics = np.hstack([(np.eye(n) - model.A) * self.size, -model.B[:, :m] * self.unit])
+        self._row = np.maximum(np.linalg.norm(dynamics, axis=1), np.finfo(float).tiny)
+        dynamics /= self._row[:, None]
+        self.basis: Array = null_space(dynamics, rcond=INTEGRATES)
+        self._inverse = np.linalg.pinv(dynamics, rcond=INTEGRATES)
+
+    def particular(self, forcing: Array) -> Array:
+        """One steady state where disturbances add `forcing`, shape (n,), to the states at each sample."""
+        found: Array = self._inverse @ (forcing / self._row)
+        return found
+
+
 class SteadyTarget:
     """Finds the steady target of a problem's model; one small program a change of reference or disturbance."""
 
     def __init__(self, problem: TrackingProblem, parameter: Parameter) -> None:
-        from scipy.linalg import matrix_balance, null_space
-
         self._problem, self._parameter = problem, parameter
         model = problem.model
         n, m, l = model.n_states, model.n_inputs, model.n_outputs
-        B, D = model.B[:, :m], model.D[:, :m]
-        response = model.step_response(problem.prediction_horizon + 1)[:, :, :m]
-        root = square_root(problem.output_weight)
-        gain = np.abs(root @ response).max(axis=(0, 1))
-        self._unit = 1 / np.where(gain > 0, gain, 1.0)
-        # States in units that make the model's numbers alike, so that a small singular value is an integrator.
-        _, (size, _) = matrix_balance(model.A, permute=False, separate=True)
-        dynamics = np.hstack([(np.eye(n) - model.A) * size, -B * self._unit])
-        self._row = np.maximum(np.linalg.norm(dynamics, axis=1), np.finfo(float).tiny)
-        dynamics /= self._row[:, None]
-        # Everything steady is a particular solution plus a combination of these columns.
-        self._steady = null_space(dynamics, rcond=INTEGRATES)
-        self._particular = np.linalg.pinv(dynamics, rcond=INTEGRATES)
-        self._outputs = root @ np.hstack([model.C * size, D * self._unit])
-        self._size = size
-        self._root = root
+        self._states = states = SteadyStates(problem)
+        self._unit, self._size, self._steady = states.unit, states.size, states.basis
+        self._root = root = square_root(problem.output_weight)
+        self._outputs = root @ np.hstack([model.C * self._size, model.D[:, :m] * self._unit])
         to_u = self._steady[n:]
         weighted = self._outputs @ self._steady
         k = self._steady.shape[1]
@@ -74,7 +91,7 @@ class SteadyTarget:
         reference = p[-l:]  # from the operating point, as v is
         forcing = model.B @ np.concatenate([d_u, v])
         feed = model.D @ np.concatenate([d_u, v])
-        particular = self._particular @ (forcing / self._row)
+        particular = self._states.particular(forcing)
         missing = self._root @ (reference - p[at.output_disturbance] - feed)
         missing = missing - self._outputs @ particular
         f = -2 * self._weighted.T @ missing + 2 * NEAREST * self._to_u.T @ particular[n:]

@@ -144,6 +144,9 @@ class ProblemTable(Table):
     weigh_first_move: bool = True
     output_limit_weight: Positive = 1e4
     tail_horizon: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    u_target: Values | None = None
+    u_target_weight: Weight = 0.0
+    u_cost: Values = 0.0
 
 
 class ChangeTable(Table):
