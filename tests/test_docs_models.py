@@ -13,3 +13,9 @@ def test_the_python_of_the_page_runs():
         exec(block.split("```")[0], scope)
     np.testing.assert_allclose(scope["column"].dc_gain(), [[12.8, -18.9], [6.6, -19.4]])
     assert scope["error"].max() <= 0.01
+    assert scope["found"].accepted
+    off = scope["plant"].dc_gain() / scope["column"].dc_gain()
+    assert (
+        np.abs(scope["corrected"].dc_gain() / scope["plant"].dc_gain() - 1).max()
+        < np.abs(1 / off - 1).max() / 2
+    )

@@ -16,6 +16,7 @@ from mampc.loop import loads
 from mampc.loop.batch import Batch, simulate_batch
 from mampc.loop.estimation import KalmanFilter
 from mampc.loop.hypotheses import Hypothesis
+from mampc.loop.learnt_gains import LearntGains, learn_gains
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.metrics import Metrics
 from mampc.loop.reference_filter import ReferenceFilter
@@ -67,6 +68,7 @@ __all__ = [
     "IOData",
     "Identified",
     "KalmanFilter",
+    "LearntGains",
     "Limits",
     "LoadBank",
     "LoadKind",
@@ -96,6 +98,7 @@ __all__ = [
     "Valves",
     "excite",
     "largest_offset",
+    "learn_gains",
     "linearise",
     "loads",
     "n4sid",

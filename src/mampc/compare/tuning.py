@@ -26,7 +26,8 @@ from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.state_space import StateSpace
 
-MOVE_WEIGHTS = (0.03, 0.3)  # times those of plain MPC
+MOVE_WEIGHTS = (0.1, 0.3)  # times those of plain MPC
+TAILS = (0.0, 0.25, 1.0)  # times the prediction horizon
 CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
 MOST_MOVES = (
     9  # planned moves of all inputs together, within these, which keeps the patterns to a few hundred
@@ -348,11 +349,11 @@ def candidates(problem: TrackingProblem, noise: Array) -> list[Candidate]:
     n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
     estimator, found = LoadBank(problem.model, noise=noise), []
     for share in MOVE_WEIGHTS:
-        for tail in (0, n_p):
+        for tail in TAILS:
             sparse = replace(
-                problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail
+                problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail * n_p
             )
-            candidate = Candidate(f"move weight x {share:g}, tail {tail}", sparse, estimator)
+            candidate = Candidate(f"move weight x {share:g}, tail {tail * n_p:g}", sparse, estimator)
             try:
                 candidate.regulator(1.0)
             except MampcError:  # such as a tail that an unstable model does not have
