@@ -56,6 +56,21 @@ def calls(v):
     yield "validate", lambda: mampc.validate(MODEL, v)
     yield "validate model", lambda: mampc.validate(v, DATA)
     yield "excite", lambda: mampc.excite(MODEL, v, dt=1.0)
+    for k in (
+        "gain",
+        "settling_time",
+        "noise",
+        "dead_time",
+        "integrating",
+        "dt",
+        "around",
+        "max_amplitude",
+        "accuracy",
+    ):
+        yield (
+            f"plan_test {k}",
+            lambda k=k: mampc.plan_test(**({"gain": 2.0, "settling_time": 60.0, "noise": 0.1} | {k: v})),
+        )
     yield "linearise", lambda: mampc.linearise(v)
     yield "prbs", lambda: mampc.prbs(order=v, amplitude=1.0)
     yield "prbs amplitude", lambda: mampc.prbs(order=4, amplitude=v)

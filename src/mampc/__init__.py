@@ -11,7 +11,18 @@ from mampc.compare.tuning import Tuned, tune
 from mampc.controllers import MAMPC, MPC, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
 from mampc.controllers.targets import Targets, targets
-from mampc.identification import Export, Identified, IOData, Validation, excite, n4sid, read_export, validate
+from mampc.identification import (
+    Export,
+    Identified,
+    IOData,
+    PlannedTest,
+    Validation,
+    excite,
+    n4sid,
+    plan_test,
+    read_export,
+    validate,
+)
 from mampc.loop import loads
 from mampc.loop.batch import Batch, simulate_batch
 from mampc.loop.estimation import KalmanFilter
@@ -80,6 +91,7 @@ __all__ = [
     "Names",
     "Noise",
     "PenaltyDecomposition",
+    "PlannedTest",
     "Recording",
     "ReferenceFilter",
     "Regulator",
@@ -102,6 +114,7 @@ __all__ = [
     "linearise",
     "loads",
     "n4sid",
+    "plan_test",
     "plants",
     "prbs",
     "read_export",

@@ -232,7 +232,7 @@ def _reading(
     good: list[str] | None, **plain: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """The arguments of `read_export`, out of those of the command line."""
-    words = {"inputs": _words(inputs), "outputs": _words(outputs), "disturbances": _words(disturbances)}
+    columns = {"inputs": words(inputs), "outputs": words(outputs), "disturbances": words(disturbances)}
     limits = {}
     for text in ranges or ():
         name, _, values = text.rpartition("=")
@@ -241,9 +241,9 @@ def _reading(
             limits[name.strip()] = (float(low), float(high))
         except ValueError:
             raise MampcError(f"--range: expected COLUMN=LOW:HIGH, received {text!r}") from None
-    return words | plain | {"bad": bad or (), "good": good or (), "ranges": limits}
+    return columns | plain | {"bad": bad or (), "good": good or (), "ranges": limits}
 
 
-def _words(text: str) -> list[str]:
+def words(text: str) -> list[str]:
     """Words between commas; one that holds a comma stands in quotation marks."""
     return [word.strip() for row in csv.reader([text], skipinitialspace=True) for word in row if word.strip()]

@@ -13,6 +13,7 @@ import numpy as np
 from mampc.base.checks import as_number
 from mampc.base.errors import MampcError
 from mampc.identification import Identified, IOData, Validation, n4sid, read_export
+from mampc.identification.excitation import left_open, movement_of
 from mampc.identification.export.findings import counted
 from mampc.report.figures import validation_figure
 from mampc.report.output import save_figure
@@ -73,7 +74,14 @@ def identify_and_write(
     require_writable(target)
     estimation, rest = hold_out(long_enough(records, notes), share)
     show("identifying a model")
-    identified = n4sid(estimation if len(estimation) > 1 else estimation[0], progress=show, **settings)
+    try:
+        identified = n4sid(estimation if len(estimation) > 1 else estimation[0], progress=show, **settings)
+    except MampcError as error:
+        told = [
+            *movement_of(estimation),
+            "`mampc plan-test` says how far, how often and how long to move inputs",
+        ]
+        raise MampcError("\n  - ".join([str(error), *told])) from None
     validation = identified.validate(rest)
     show("estimating how certain it is")
     identified = replace(
@@ -92,6 +100,10 @@ def identify_and_write(
             f"the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at the "
             "figure, and try another --order or --detrend, or a richer record"
         )
+    unsaid = left_open(identified.model, records)
+    warnings += unsaid
+    if unsaid or poor:
+        warnings.append(f"plan a better record: mampc plan-test test.csv --model {target}")
     try:
         save_figure(validation_figure(rest, validation), target.with_suffix(""))
     except MampcError as error:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.systems.properties import Properties, properties, time_in_words
+from mampc.systems.properties import doubtful_gains, gain_deviation, properties, time_in_words
 from mampc.systems.state_space import StateSpace
 
 INTERACTING = 10.0  # condition number, or relative gain, from which one is told
@@ -19,7 +19,7 @@ def model_tables(model: StateSpace) -> list[Any]:
 
     found = properties(model)
     inputs, outputs = (*model.names.inputs, *model.names.disturbances), model.names.outputs
-    deviation = _gain_deviation(model, found)
+    deviation = gain_deviation(model, found)
     units = dict(model.names.units)
     channels = Table(title="channels")
     channels.add_column("output")
@@ -82,29 +82,10 @@ def model_words(model: StateSpace) -> list[str]:
             sentences.append(
                 f"wandering of the outputs: {_named(model.names.outputs, model.noise.drift)} a sample"
             )
-    doubtful = _doubtful(model, found)
+    doubtful = doubtful_gains(model, found)
     if doubtful:
         sentences.append(f"the sign of the gain is uncertain: {', '.join(doubtful)}; move these inputs more")
     return sentences
-
-
-def _gain_deviation(model: StateSpace, found: Properties) -> Any:
-    """Standard deviations of the gains, (l, m + d), where the record told those of the step response."""
-    deviation = None if model.evidence is None else model.evidence.deviation
-    if deviation is None:
-        return None
-    length = max(len(deviation) - 1, 1) * model.dt
-    return deviation[-1] / np.where(found.integrating, length, 1.0)
-
-
-def _doubtful(model: StateSpace, found: Properties) -> list[str]:
-    """Channels whose gain is less than two standard deviations, named."""
-    deviation = _gain_deviation(model, found)
-    if deviation is None:
-        return []
-    inputs = (*model.names.inputs, *model.names.disturbances)
-    weak = (np.abs(found.gain) < 2 * deviation) & (found.gain != 0)
-    return [f"{model.names.outputs[i]} from {inputs[j]}" for i, j in np.argwhere(weak)]
 
 
 def _unit(output: str | None, of_input: str | None, integrates: bool) -> str:

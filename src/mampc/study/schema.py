@@ -43,7 +43,7 @@ LONGEST_NAME = 80  # bytes, in file names that hold two of them
 _SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-def _time(value: Any) -> Any:
+def time_in_seconds(value: Any) -> Any:
     """A number of seconds, or text with a unit of time."""
     if not isinstance(value, str):
         return value
@@ -81,8 +81,8 @@ def _short_as_file(name: str) -> str:
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
-Time = Annotated[float, BeforeValidator(_time), Field(gt=0, allow_inf_nan=False)]
-Lag = Annotated[float, BeforeValidator(_time), Field(ge=0, allow_inf_nan=False)]
+Time = Annotated[float, BeforeValidator(time_in_seconds), Field(gt=0, allow_inf_nan=False)]
+Lag = Annotated[float, BeforeValidator(time_in_seconds), Field(ge=0, allow_inf_nan=False)]
 Rate = Annotated[float, BeforeValidator(_rate), Field(gt=0, allow_inf_nan=False)]
 Values = Number | list[Number]
 Weight = Number | list[Number] | list[list[Number]]

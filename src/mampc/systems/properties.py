@@ -217,6 +217,26 @@ def _is_zero(model: StateSpace, zero: complex) -> bool:
         return False
 
 
+def gain_deviation(model: StateSpace, found: Properties) -> Array | None:
+    """Standard deviations of the gains, (l, m + d), where the record told those of the step response."""
+    deviation = None if model.evidence is None else model.evidence.deviation
+    if deviation is None:
+        return None
+    length = max(len(deviation) - 1, 1) * model.dt
+    spread: Array = deviation[-1] / np.where(found.integrating, length, 1.0)
+    return spread
+
+
+def doubtful_gains(model: StateSpace, found: Properties) -> list[str]:
+    """Channels whose gain is less than two standard deviations, named."""
+    deviation = gain_deviation(model, found)
+    if deviation is None:
+        return []
+    inputs = (*model.names.inputs, *model.names.disturbances)
+    weak = (np.abs(found.gain) < 2 * deviation) & (found.gain != 0)
+    return [f"{model.names.outputs[i]} from {inputs[j]}" for i, j in np.argwhere(weak)]
+
+
 def channels_in_words(model: StateSpace, most: int = 9) -> list[str]:
     """A line each for the first channels: gain, time constant, dead time."""
     found = properties(model)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
 
 from mampc.base.checks import Array, as_number
+from mampc.identification.excitation import FEW_MOVES, missing_movement
 from mampc.identification.export.clock import Clock, read_clock
-from mampc.identification.export.findings import Findings, counted
+from mampc.identification.export.findings import Findings
 from mampc.identification.export.grid import make_grid, pieces
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Column, numeric_share, read_numbers
@@ -22,8 +22,6 @@ from mampc.identification.export.sheet import Sheet
 from mampc.identification.export.tall import open_table
 
 HELD = 0.5  # share of samples: what keeps its value more often moves in steps
-FEW_MOVES = 10  # of an input; fewer say little about anything but the largest of them
-TOGETHER = 0.9  # correlation of moves from which two inputs cannot be told apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,26 +182,11 @@ def _summary(column: Column, unit: str, order: Any) -> ColumnSummary:
 
 def _missing_excitation(columns: Sequence[ColumnSummary], inputs: Sequence[str]) -> list[str]:
     """What the inputs' movement leaves open, of the columns named, else of those that could be inputs."""
-    chosen = [
-        column
+    chosen = {
+        column.name: column.values
         for column in columns
         if column.name in inputs or (not inputs and column.verdict.endswith("could be an input"))
-    ]
-    said = [
-        f"{column.name} moves {counted(column.moves, 'time')} in {counted(len(column.values), 'sample')}: move it up "
-        f"and down at least {FEW_MOVES} times"
-        for column in chosen
-        if column.moves < FEW_MOVES
-    ]
-    moves: Mapping[str, Array] = {column.name: np.nan_to_num(np.diff(column.values)) for column in chosen}
-    for (one, a), (other, b) in combinations(moves.items(), 2):
-        size = float(np.linalg.norm(a) * np.linalg.norm(b))
-        together = float(a @ b) / size if size else 0.0
-        if abs(together) > TOGETHER:
-            said.append(
-                f"{one} and {other} move together (correlation of moves {together:.2f}): their effects cannot be told "
-                "apart; move them at different times"
-            )
+    }
     if not chosen:
-        said.append("no column moves in steps, up and down, as an input under test does")
-    return said
+        return ["no column moves in steps, up and down, as an input under test does"]
+    return missing_movement(chosen)
