@@ -1,35 +1,42 @@
 """Who needs the fewest moves at equal tracking error: seven plants, five kinds of load, ours and the rivals.
 
-    python benchmarks/attention.py [--quick] [--jobs 2] [--plants tank level]
+    python benchmarks/attention.py [--quick] [--jobs 2] [--plants tank level] [--again "exact price"]
 
-Every method has one knob and three structures (how fast the estimator's loads drift). On tuning seeds each structure is
-run over the knob for every plant and load; the one that needs the fewest moves at 1.25 times plain MPC's error is run
-over the knob again on other seeds. All methods are tuned alike, with the same number of simulations. Results and what
-made them go to benchmarks/results/attention.json; `--draw` makes the heat map and the tables of docs/comparison.md.
+Every method has one knob and three structures (how fast the estimator's loads drift, or the tail of the horizon).
+In scenarios of its own each structure is run over the knob for every plant and load; the one with the fewest moves at
+1.25 times plain MPC's error goes on, about the knob that led there, in other scenarios, from which the results come.
+All methods are tuned alike, with the same number of simulations.
+
+What is finished is kept line by line in benchmarks/results/attention/, and a run that was killed goes on from there.
+Results and what made them go to benchmarks/results/attention.json, tables and the heat map to docs/comparison.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import platform
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
 
 import mampc
 from mampc import loads, rivals
-from mampc.compare.fronts import RATIOS, Point, moves_at
-from mampc.loop.batch import simulate_batch
+from mampc.compare.fronts import Point, moves_at
+from mampc.compare.journal import Journal
 
 RESULTS = Path(__file__).parent / "results"
-TUNING, EVALUATION = range(1000, 1003), range(6)
+TUNING, EVALUATION = range(1000, 1004), range(8)  # seeds
 STEPS = 200
-KNOB = np.geomspace(1 / 30, 30, 9)
+KNOB = np.geomspace(1 / 30, 30, 6)  # of the tuning, in units of noise
+ABOUT = np.geomspace(1 / 6, 6, 9)  # of the evaluation, about the knob that was found
+RATIO = 1.25  # of errors, that methods are tuned for
 LOADS = ("none", "steps", "wandering", "coloured", "sinusoidal")
 
 
@@ -46,6 +53,7 @@ class Case:
 
 
 def cases() -> dict[str, Case]:
+    """The plants by name, in the order of the tables."""
     tank, leaky = mampc.plants.QuadrupleTank(), Leaky()
     cell, reactor, level = mampc.plants.SolidOxideFuelCell(), mampc.plants.VanDeVusse(), mampc.plants.Level()
     column, third = mampc.plants.wood_berry(), mampc.plants.ogunnaike_ray()
@@ -116,102 +124,120 @@ def problem_of(
     )  # fmt: skip
 
 
-def estimator_of(case: Case, drift: float) -> mampc.KalmanFilter:
+def estimator_of(case: Case, drift: float | str) -> Any:
+    """A filter whose loads drift by so much of the noise, or the bank of filters."""
+    if drift == "bank":
+        return mampc.LoadBank(case.model, noise=case.noise)
     return mampc.KalmanFilter.offset_free(case.model, measurement_noise=case.noise, drift=drift * case.noise)
 
 
-def regulator_of(case: Case, method: str, structure: tuple, knob: float) -> mampc.Regulator:
-    """One method with one structure at one value of its knob, which counts in units of noise."""
+def regulators_of(case: Case, method: str, structure: tuple, knobs: Any) -> list[mampc.Regulator]:
+    """One method with one structure at some values of its knob, which counts in units of noise."""
     drift, tail, lighter = structure
-    unit, sigma = per_input(case), case.noise
-    mpc = mampc.MPC(problem_of(case))
-    made = {
-        "MPC": lambda: mpc,
-        "dead-band": lambda: rivals.DeadBand(mpc, size=knob * unit),
-        "rounding": lambda: rivals.Rounded(mpc, step=knob * unit),
-        "rounding, hysteresis": lambda: rivals.Rounded(mpc, step=knob * unit, hysteresis=0.4),
-        "event-triggered": lambda: rivals.EventTriggered(mpc, threshold=knob * sigma),
-        "quiet zone": lambda: rivals.QuietZone(mpc, band=knob * sigma),
-        "l1 on moves": lambda: rivals.Penalised(problem_of(case), penalty=rivals.L1(weight=knob, size=unit)),
-        "exact price": lambda: mampc.MAMPC(
-            problem_of(case, lighter=lighter, tail=tail, moves=3), mampc.MoveRules(price=10 * knob)
-        ),
-    }[method]()
-    return mampc.Regulator(made, estimator_of(case, drift))
+    unit, sigma, name = per_input(case), case.noise, method.removesuffix(", load bank")
+    ours = name == "exact price"
+    problem = problem_of(case, lighter=lighter, tail=tail, moves=3) if ours else problem_of(case)
+    mpc, estimator = mampc.MPC(problem), estimator_of(case, drift)
+    make = {
+        "MPC": lambda knob: mpc,
+        "dead-band": lambda knob: rivals.DeadBand(mpc, size=knob * unit),
+        "rounding": lambda knob: rivals.Rounded(mpc, step=knob * unit),
+        "rounding, hysteresis": lambda knob: rivals.Rounded(mpc, step=knob * unit, hysteresis=0.4),
+        "event-triggered": lambda knob: rivals.EventTriggered(mpc, threshold=knob * sigma),
+        "l1 on moves": lambda knob: rivals.Penalised(problem, penalty=rivals.L1(weight=10 * knob, size=unit)),
+        "exact price": lambda knob: mampc.MAMPC(problem, mampc.MoveRules(price=100 * knob)),
+    }[name]  # fmt: skip
+    return [
+        mampc.Regulator(make(float(knob)), estimator, value_of_information=drift == "bank") for knob in knobs
+    ]
 
 
-RIVAL_STRUCTURES = tuple((drift, 0.0, 1.0) for drift in (0.1, 0.3, 1.0))
-STRUCTURES = {
-    "MPC": ((0.3, 0.0, 1.0),),
-    **dict.fromkeys(
-        ("dead-band", "rounding", "rounding, hysteresis", "event-triggered", "quiet zone", "l1 on moves"),
-        RIVAL_STRUCTURES,
-    ),
+BASELINE = "MPC", (0.3, 0.0, 1.0)
+DRIFTS = tuple((drift, 0.0, 1.0) for drift in (0.1, 0.3, 1.0))
+METHODS = {
     "exact price": tuple((drift, 20.0, 0.1) for drift in (0.1, 0.3, 1.0)),
+    "exact price, load bank": (("bank", 0.0, 0.3), ("bank", 20.0, 0.3), ("bank", 20.0, 0.1)),
+    "dead-band": DRIFTS,
+    "rounding": DRIFTS,
+    "rounding, hysteresis": DRIFTS,
+    "event-triggered": DRIFTS,
+    "l1 on moves": DRIFTS,
 }
 
 
-def measured(name: str, kind: str, method: str, structure: tuple, knobs, seeds) -> list[Point]:
-    """Moves and errors over the knob."""
-    case, points = cases()[name], []
-    for knob in knobs:
-        regulator = regulator_of(case, method, structure, float(knob))
-        batch = simulate_batch(
-            case.plant, regulator, reference_of(case), seeds=seeds, noise=case.noise, loads=load_of(kind, case),
-            progress=False,
-        )  # fmt: skip
-        moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2))
-        error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2))
-        points.append(Point(method, float(knob), moves.astype(float), error))
-    return points
+def measured(case: Case, kind: str, method: str, structure: tuple, knobs: Any, seeds: range) -> list[Point]:
+    """A method over its knob, in the same scenarios at every value."""
+    regulators = regulators_of(case, method, structure, knobs)
+    batch = mampc.simulate_batch(
+        case.plant, [own for own in regulators for _ in seeds], reference_of(case), seeds=[*seeds] * len(knobs),
+        noise=case.noise, loads=load_of(kind, case), progress=False,
+    )  # fmt: skip
+    moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2)).reshape(-1, len(seeds))
+    error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2)).reshape(-1, len(seeds))
+    return [
+        Point(method, float(knob), m.astype(float), e) for knob, m, e in zip(knobs, moves, error, strict=True)
+    ]
 
 
-def cell(name: str, kind: str, quick: bool) -> dict:
-    """One plant under one kind of load: every method tuned, then measured on other seeds."""
-    knobs = KNOB[::2] if quick else KNOB
+def knob_at(points: list[Point], baseline: Point) -> float:
+    """Where a method reaches the error that it is tuned for, errors rising with the knob."""
+    error = np.maximum.accumulate([p.error.mean() / baseline.error.mean() for p in points])
+    return float(np.exp(np.interp(RATIO, error, np.log([p.value for p in points]))))
+
+
+def cell(name: str, kind: str, method: str, quick: bool) -> dict:
+    """One method on one plant under one kind of load: tuned, then measured in other scenarios."""
+    case, began = cases()[name], time.time()
+    knobs, about = (KNOB[::2], ABOUT[::4]) if quick else (KNOB, ABOUT)
     tuning, evaluation = (TUNING[:1], EVALUATION[:2]) if quick else (TUNING, EVALUATION)
-    base = {
-        seeds: measured(name, kind, "MPC", STRUCTURES["MPC"][0], [1.0], seeds)[0]
-        for seeds in (tuning, evaluation)
-    }
-    found: dict = {"plant": name, "load": kind, "moves of MPC": float(base[evaluation].moves.mean())}
-    for method, structures in STRUCTURES.items():
-        if method == "MPC":
-            continue
-        tried = {s: measured(name, kind, method, s, knobs, tuning) for s in structures}
-        at = {s: moves_at(points, base[tuning], 1.25).value for s, points in tried.items()}
-        best = min(structures, key=lambda s: at[s] if np.isfinite(at[s]) else np.inf)
-        points = measured(name, kind, method, best, knobs, evaluation)
-        found[method] = {
-            "structure": best,
-            **{f"{ratio:g}": list(moves_at(points, base[evaluation], ratio)) for ratio in RATIOS},
-        }
-    return found
+    [base], [baseline] = (measured(case, kind, *BASELINE, [1.0], seeds) for seeds in (tuning, evaluation))
+    structures = METHODS[method]
+    each = [measured(case, kind, method, structure, knobs, tuning) for structure in structures]
+    at = [moves_at(own, base, RATIO).value for own in each]
+    best = int(np.argmin(np.where(np.isfinite(at), at, np.inf)))
+    knob, structure = knob_at(each[best], base), structures[best]
+    points = measured(case, kind, method, structure, knob * about, evaluation)
+    return {
+        "plant": name, "load": kind, "method": method, "structure": structure, "tuned to": at[best],
+        "points": [
+            {"knob": p.value, "moves": p.moves.tolist(), "error": [float(f"{e:.6g}") for e in p.error]}
+            for p in (baseline, *points)
+        ],
+        "seconds": round(time.time() - began, 1),
+    }  # fmt: skip
 
 
-def run(quick: bool, jobs: int, plants: list[str]) -> None:
-    work = [(name, kind) for name in cases() if not plants or name in plants for kind in LOADS]
-    began, found = time.time(), []
+def run(quick: bool, jobs: int, plants: list[str], again: list[str]) -> None:
+    """Whatever is not finished; the results of all that is."""
+    journals = {}
+    for method, structures in METHODS.items():
+        constants = f"{quick} {TUNING} {EVALUATION} {STEPS} {KNOB} {ABOUT} {RATIO} {method} {structures}"
+        path = RESULTS / "attention" / f"{method.replace(', ', '-').replace(' ', '-')}.jsonl"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if method in again:
+            path.unlink(missing_ok=True)
+        journals[method] = Journal(path, hashlib.sha256(constants.encode()).hexdigest()[:16])
+    work = [(name, kind) for kind in LOADS for name in cases() if not plants or name in plants]
+    missing = [
+        (*where, method) for where in work for method in METHODS if str(where) not in journals[method].done
+    ]
+    began = time.time()
     parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
-    for number, result in enumerate(parallel(delayed(cell)(*w, quick) for w in work), 1):
-        found.append(result)
-        left = (time.time() - began) / number * (len(work) - number)
-        print(
-            f"{number} of {len(work)} cells, {left / 60:.0f} min left: {result['plant']}, {result['load']}",
-            file=sys.stderr,
-        )
-    order = {w: i for i, w in enumerate(work)}
-    found.sort(key=lambda r: order[r["plant"], r["load"]])
-    RESULTS.mkdir(exist_ok=True)
+    results = parallel(delayed(cell)(*task, quick) for task in missing)
+    for number, found in enumerate(results, 1):
+        journals[found["method"]].add(str((found["plant"], found["load"])), [found])
+        left = (time.time() - began) / number * (len(missing) - number)
+        told = ", ".join(found[key] for key in ("plant", "load", "method"))
+        print(f"{number} of {len(missing)}, {left / 60:.0f} min left: {told}", file=sys.stderr)
+    rows = [journals[method].done[str(where)][0] for where in work for method in METHODS]
     made_by = {
         "command": "python " + " ".join(["benchmarks/attention.py", *sys.argv[1:]]),
-        "python": platform.python_version(),
-        "numpy": np.__version__, "mampc": mampc.__version__, "machine": platform.machine(),
-        "steps": STEPS, "tuning seeds": 1 if quick else len(TUNING),
-        "evaluation seeds": 2 if quick else len(EVALUATION),
-        "minutes": round((time.time() - began) / 60, 1),
+        "python": platform.python_version(), "numpy": np.__version__, "mampc": mampc.__version__,
+        "machine": platform.machine(), "minutes of one core": round(sum(row["seconds"] for row in rows) / 60, 1),
+        "samples": STEPS, "scenarios to tune in": len(TUNING[:1] if quick else TUNING),
+        "scenarios to measure in": len(EVALUATION[:2] if quick else EVALUATION),
     }  # fmt: skip
-    (RESULTS / "attention.json").write_text(json.dumps({"made by": made_by, "cells": found}, indent=1) + "\n")
+    (RESULTS / "attention.json").write_text(json.dumps({"made by": made_by, "cells": rows}, indent=0) + "\n")
 
 
 def main() -> None:
@@ -221,12 +247,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer seeds and settings, to see that it runs")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--plants", nargs="*", default=[], help="only these")
+    parser.add_argument("--again", nargs="*", default=[], help="methods to run anew")
     parser.add_argument(
         "--draw", action="store_true", help="tables and the heat map from the results there are"
     )
     given = parser.parse_args()
     if not given.draw:
-        run(given.quick, given.jobs, given.plants)
+        run(given.quick, given.jobs, given.plants, given.again)
     import attention_report
 
     attention_report.write(RESULTS / "attention.json")

@@ -132,6 +132,27 @@ def test_each_loop_may_have_its_own_regulator():
         mampc.simulate_batch(TANK, own, tank_reference(4), seeds=range(2))
 
 
+def test_values_of_a_setting_are_stepped_together_as_one_by_one(monkeypatch):
+    problem, estimator = tank_problem(), mampc.KalmanFilter.offset_free(tank_problem().model)
+    mpc = mampc.MPC(problem)
+    controllers = [
+        mpc, mampc.rivals.DeadBand(mpc, size=(0.5, 1.0)), mampc.rivals.Rounded(mpc, step=1.0, hysteresis=0.3),
+        mampc.MAMPC(problem, mampc.MoveRules(price=0.3)), mampc.MAMPC(problem, mampc.MoveRules(price=3.0)),
+    ]  # fmt: skip
+    for bank in (False, True):
+        own = mampc.LoadBank(problem.model, noise=0.1) if bank else estimator
+        loops = [mampc.Regulator(controller, own) for controller in controllers]
+        every = [loop for loop in loops for _ in range(2)]
+        options = {"noise": 0.1, "loads": [loads.RandomSteps(size=1.0, every=200.0)]}
+        seeds = [0, 1] * len(loops)
+        with monkeypatch.context() as patch:
+            patch.setattr("mampc.loop.batch.closed_loops", None)  # nothing is left for it
+            batch = mampc.simulate_batch(TANK, every, tank_reference(60), seeds=seeds, **options)
+        for s, loop in enumerate(every):
+            run = mampc.simulate(TANK, loop, tank_reference(60), seed=seeds[s], **options)
+            np.testing.assert_allclose(batch.u[s], run.u, atol=1e-8, rtol=0)
+
+
 def test_a_plant_with_measured_disturbances_and_faults():
     plant = mampc.plants.SolidOxideFuelCell()
     model = mampc.linearise(plant).discretise(0.5)
@@ -222,7 +243,7 @@ def test_the_best_pattern_is_that_of_the_search():
     rng, m, n = np.random.default_rng(0), 2, 3
     from mampc.loop.batched_plans import batched_plans
 
-    plans = batched_plans(controller, preview=False)
+    [plans] = batched_plans([controller], preview=False)
     assert isinstance(plans, BatchedExact)
     x, u = rng.standard_normal((50, n)), np.tile(problem.model.u_op, (50, 1))
     r = problem.model.y_op + rng.standard_normal((50, 2))

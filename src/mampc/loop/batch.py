@@ -13,7 +13,7 @@ from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.base.progress import watched
 from mampc.controllers.decision import ControllerState, Decision
-from mampc.loop.batched_plans import BatchedPlans, batched_plans
+from mampc.loop.batched_plans import EachPlans, batched_plans
 from mampc.loop.estimation import KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.loads import Load
@@ -163,9 +163,9 @@ def simulate_batch(
     courses = [one.drawn(seed) for one, seed in zip(acting, seeds, strict=True)]
     keep = as_flag("keep_decisions", keep_decisions)
     first, plans = regulators[0], None
-    everyday = type(first) is Regulator and type(first.estimator) in (KalmanFilter, LoadBank)
-    if everyday and not keep and all(one is first for one in regulators):
-        plans = batched_plans(first._planner, preview or first.reference_filter is not None)
+    if not keep and all(_steps_like(own, first) for own in regulators):
+        ahead = preview or first.reference_filter is not None
+        plans = batched_plans([own._planner for own in regulators], ahead)
     model, T = first.controller.problem.model, len(courses[0])
     if any(own.controller.problem.model.dt != model.dt for own in regulators):
         raise MampcError("regulator: expected the same sample time in all, received several")
@@ -182,7 +182,7 @@ def simulate_batch(
                 next(bar)
                 records.take(k, part, moment, keep)
             continue
-        loops = _Loops(plants[rows], first, courses[rows], plans, preview, valves)
+        loops = _Loops(plants[rows], regulators[rows], courses[rows], EachPlans(plans[rows]), preview, valves)
         for k in range(T):
             next(bar)
             loops.step(k, records, part)
@@ -236,13 +236,14 @@ class _Loops:
     def __init__(
         self,
         plants: Sequence[Plant | StateSpace],
-        regulator: Regulator,
+        regulators: Sequence[Regulator],
         courses: Sequence[Course],
-        plans: BatchedPlans,
+        plans: EachPlans,
         preview: bool,
         valves: Valves | None,
     ) -> None:
-        model, self._regulator, self._plans = regulator.controller.problem.model, regulator, plans
+        regulator = regulators[0]
+        model, self._regulators, self._plans = regulator.controller.problem.model, regulators, plans
         self._n_p = regulator.controller.problem.prediction_horizon if preview else None
         self._has_v = bool(model.n_disturbances)
         self._noise, self._at_inputs, self._at_outputs, self._v, self._reference = (
@@ -294,18 +295,19 @@ class _Loops:
 
     def _decide(self, k: int, y: Array, v: Array) -> Array:
         """The inputs after the measurements y (S, l), with the measured disturbances v (S, d)."""
-        sensors, last, u = self._regulator._sensors, self._estimate, self._inputs[:, -1]
+        regulator = self._regulators[0]  # all of them estimate alike
+        sensors, last, u = regulator._sensors, self._estimate, self._inputs[:, -1]
         told = v if self._has_v else self._v_last
-        estimator = cast(KalmanFilter | LoadBank, self._regulator.estimator)
+        estimator = cast(KalmanFilter | LoadBank, regulator.estimator)
         estimate, innovation, _ = estimator.updates(last, u, y, self._v_last, told)
         fine = sensors.are_fine(self._sensors, y, innovation)
         after = sensors.after_fine(self._sensors, y, estimator.loads_of(last))
         asked = self._reference[k : k + self._n_p + 1].swapaxes(0, 1) if self._n_p else self._reference[k]
         tracked, ahead = self._tracked, asked.reshape(len(y), -1)
         if self._filter is not None and tracked is not None:
-            course = self._filter.course(tracked, asked, self._regulator._samples)
+            course = self._filter.course(tracked, asked, regulator._samples)
             tracked, ahead = course[:, 0], course.reshape(len(y), -1)
-        place = self._regulator._planner.condensed.parameter
+        place = regulator._planner.condensed.parameter
         parameters = np.ones((len(y), place.one.stop + ahead.shape[1]))
         parameters[:, place.x], parameters[:, place.u_previous] = estimate.x, u
         parameters[:, place.u_deviation] = u
@@ -349,7 +351,7 @@ class _Loops:
     def _step_one(self, s: int, state: RegulatorState, y: Array, asked: Array, v: Array) -> None:
         """An ordinary step of one loop."""
         told: dict[str, Any] = {"measured_disturbance": v} if self._has_v else {}
-        decision = self._regulator.step(state, y, asked, **told)
+        decision = self._regulators[s].step(state, y, asked, **told)
         state = decision.state
         self._inputs[s], self._active[s] = state.controller.inputs, state.controller.active
         for stack, own in ((self._estimate, state.estimate), (self._sensors, state.sensors)):
@@ -358,6 +360,18 @@ class _Loops:
         self._v_last[s] = state.measured_disturbance
         if self._tracked is not None:
             self._tracked[s] = state.reference
+
+
+def _steps_like(own: Regulator, other: Regulator) -> bool:
+    """Whether a regulator estimates as arrays can, and as another one."""
+    if type(own) is not Regulator or type(own.estimator) not in (KalmanFilter, LoadBank):
+        return False
+    return own is other or (
+        own.estimator is other.estimator
+        and own.controller.problem is other.controller.problem
+        and own.sensors is other.sensors
+        and own.reference_filter is other.reference_filter
+    )
 
 
 def _copied(stack: Any) -> Any:

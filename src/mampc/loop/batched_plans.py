@@ -13,6 +13,7 @@ another pattern is as good up to rounding, or where anything else asks for a clo
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -22,7 +23,9 @@ from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.methods import Exact
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
+from mampc.program.condensing import CondensedQP
 from mampc.program.sample import Optimum, Sample
+from mampc.rivals.rules import DeadBand, Rounded, Rule
 
 LARGEST_TABLE = 1_000_000  # entries
 BLOCK = 1_000_000  # entries of the costs of all patterns in some loops that are looked at together
@@ -76,24 +79,19 @@ class BatchedPlans:
         return decided & ((first >= self._low) & (first <= self._high)).all(axis=1), first
 
 
-class BatchedExact(BatchedPlans):
-    """The exact search of many loops, by a table of all patterns."""
+class PatternTable:
+    """What every pattern costs and leads to, whatever the price."""
 
-    def __init__(
-        self, controller: MAMPC, preview: bool, admissible: AdmissiblePatterns, patterns: BoolArray
-    ) -> None:
-        super().__init__(controller, preview)
-        self._admissible, self._patterns = admissible, patterns
-        self._information = controller.information
-        self._counts = np.array([admissible.count(pattern) for pattern in patterns])
-        self._charge = np.array([admissible.charge(pattern) for pattern in patterns])
-        U = self._condensed.U
-        self._size = np.linalg.norm(U, axis=0)
-        U = U / self._size  # in units that make all moves alike
+    def __init__(self, condensed: CondensedQP, patterns: BoolArray, units: list[Sample], m: int) -> None:
+        self.patterns = patterns
+        self._condensed, self._units, self._m = condensed, units, m
+        U = condensed.U
+        self.size = np.linalg.norm(U, axis=0)
+        U = U / self.size  # in units that make all moves alike
         self._rows, self._columns = np.triu_indices(len(U))
         doubled = np.where(self._rows == self._columns, 1.0, 2.0)
         self._table = np.empty((len(self._rows), len(patterns)))
-        for column, pattern in enumerate(self._patterns):
+        for column, pattern in enumerate(patterns):
             last, kept = np.flatnonzero(~pattern), int(pattern.sum())
             columns = np.concatenate([np.flatnonzero(pattern), last])
             triangle = np.asarray(np.linalg.qr(U[:, columns], mode="r"))[kept:, kept:]
@@ -101,8 +99,48 @@ class BatchedExact(BatchedPlans):
             excess[np.ix_(last, last)] = triangle.T @ triangle
             self._table[:, column] = excess[self._rows, self._columns] * doubled
         # Of the sum of |d*_i d*_k| in those units: what rounding may do to a cost.
-        self._rounding = 1e-13 + 100 * np.finfo(float).eps * float(np.linalg.cond(U))
+        self.rounding = 1e-13 + 100 * np.finfo(float).eps * float(np.linalg.cond(U))
         self._maps: OrderedDict[int, Maps] = OrderedDict()
+
+    def excess(self, d: Array) -> Array:
+        """What each pattern costs more than the free optimum d (S, n_moves) in units of `size`, shape (S, K)."""
+        product: Array = (d.take(self._rows, axis=1) * d.take(self._columns, axis=1)) @ self._table
+        return product
+
+    def map(self, index: int) -> Maps:
+        """The optimum on a pattern."""
+        known = self._maps.get(index)
+        if known is None:
+            optimum = self._condensed.optimum_on(self.patterns[index])
+            known = self._maps[index] = Maps([optimum.at(unit) for unit in self._units], self._m)
+            if len(self._maps) > MOST_KEPT:
+                self._maps.popitem(last=False)
+        return known
+
+
+class BatchedExact(BatchedPlans):
+    """The exact search of many loops, by a table of all patterns.
+
+    Args:
+        controller: of the problem and the model of `like`, if that is given.
+        preview: as in `batched_plans`.
+        admissible, patterns: of its rules.
+        like: whose table is shared where it is of the same patterns.
+    """
+
+    def __init__(
+        self, controller: MAMPC, preview: bool, admissible: AdmissiblePatterns, patterns: BoolArray,
+        like: BatchedPlans | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(controller, preview)
+        self._admissible, self._patterns = admissible, patterns
+        self._information = controller.information
+        self._counts = np.array([admissible.count(pattern) for pattern in patterns])
+        self._charge = np.array([admissible.charge(pattern) for pattern in patterns])
+        table: PatternTable | None = like.table if isinstance(like, BatchedExact) else None
+        if table is None or not np.array_equal(table.patterns, patterns):
+            table = PatternTable(self._condensed, patterns, self._units, self._m)
+        self.table: PatternTable = table
         self._allowances: dict[bytes, Allowance] = {}
         self._costs: dict[Allowance, Array] = {}
 
@@ -111,13 +149,13 @@ class BatchedExact(BatchedPlans):
     ) -> tuple[BoolArray, Array]:
         first = inputs[:, -1].copy()
         decided: BoolArray = ((first >= self._low) & (first <= self._high)).all(axis=1)
-        optima = self._free.at(parameters)[1] * self._size
+        optima = self._free.at(parameters)[1] * self.table.size
         best, clear = self._best(optima, inputs, hypotheses)
         decided &= clear
         order = np.argsort(best, kind="stable")
         ends = np.flatnonzero(np.diff(best[order], append=-1))
         for group in np.split(order, ends[:-1] + 1):
-            inside, moves, u = self._map(int(best[group[0]])).at(parameters[group])
+            inside, moves, u = self.table.map(int(best[group[0]])).at(parameters[group])
             small = np.abs(moves)
             decided[group] &= inside & ~((small > 0) & (small <= ROUNDING * self._condensed.move_prefix)).any(
                 axis=1
@@ -138,14 +176,14 @@ class BatchedExact(BatchedPlans):
         for start in range(0, len(optima), block):
             part = slice(start, start + block)
             d = optima[part]
-            values = (d.take(self._rows, axis=1) * d.take(self._columns, axis=1)) @ self._table
+            values = self.table.excess(d)
             values += costs[part] if len(costs) > 1 else costs
             each = np.arange(len(d))
             chosen = values.argmin(axis=1)
             least = values[each, chosen]
             values[each, chosen] = np.inf
             second = values.min(axis=1, initial=np.inf)
-            doubt = self._rounding * np.abs(d).sum(axis=1) ** 2 + TIE * np.abs(least)
+            doubt = self.table.rounding * np.abs(d).sum(axis=1) ** 2 + TIE * np.abs(least)
             best[part], clear[part] = chosen, second - least > doubt
         return best, clear
 
@@ -182,20 +220,65 @@ class BatchedExact(BatchedPlans):
             known = self._costs[allowance] = np.where(forbidden, np.inf, self._charge)
         return known
 
-    def _map(self, index: int) -> Maps:
-        known = self._maps.get(index)
-        if known is None:
-            optimum = self._condensed.optimum_on(self._patterns[index])
-            known = self._maps[index] = Maps([optimum.at(unit) for unit in self._units], self._m)
-            if len(self._maps) > MOST_KEPT:
-                self._maps.popitem(last=False)
-        return known
+
+class BatchedRule(BatchedPlans):
+    """A rule around a controller, each input by itself."""
+
+    def __init__(self, rule: Rule, preview: bool, inner: BatchedPlans) -> None:
+        super().__init__(rule, preview)
+        self._rule, self._inner = rule, inner
+
+    def decide(
+        self, parameters: Array, inputs: Array, hypotheses: Array | None = None
+    ) -> tuple[BoolArray, Array]:
+        decided, wanted = self._inner.decide(parameters, inputs, hypotheses)
+        first = self._rule.chosen(wanted, inputs[:, -1])
+        return decided & ((first >= self._low) & (first <= self._high)).all(axis=1), first
 
 
-def batched_plans(controller: Controller, preview: bool) -> BatchedPlans | None:
-    """The plans of many loops under one controller, or None for controllers that are stepped one by one."""
+class EachPlans:
+    """The plans of loops that have a controller each."""
+
+    def __init__(self, each: Sequence[BatchedPlans]) -> None:
+        self._groups = [
+            (plans, np.array([s for s, own in enumerate(each) if own is plans]))
+            for plans in dict.fromkeys(each)
+        ]
+
+    def decide(
+        self, parameters: Array, inputs: Array, hypotheses: Array | None = None
+    ) -> tuple[BoolArray, Array]:
+        """As in `BatchedPlans`."""
+        if len(self._groups) == 1:
+            return self._groups[0][0].decide(parameters, inputs, hypotheses)
+        decided, first = np.empty(len(inputs), dtype=bool), np.empty_like(inputs[:, -1])
+        for plans, loops in self._groups:
+            likely = None if hypotheses is None else hypotheses[loops]
+            decided[loops], first[loops] = plans.decide(parameters[loops], inputs[loops], likely)
+        return decided, first
+
+
+def batched_plans(controllers: Sequence[Controller], preview: bool) -> list[BatchedPlans] | None:
+    """The plans of loops under these controllers, which share problem and model, one for each.
+
+    None where one of them is stepped loop by loop, or where they remember unlike numbers of inputs.
+    """
+    made: dict[Controller, BatchedPlans] = {}
+    last = None
+    for controller in dict.fromkeys(controllers):
+        plans = _plans_of(controller, preview, last)
+        if plans is None or (last is not None and plans.memory != last.memory):
+            return None
+        made[controller] = last = plans
+    return [made[controller] for controller in controllers]
+
+
+def _plans_of(controller: Controller, preview: bool, like: BatchedPlans | None) -> BatchedPlans | None:
     if type(controller) is MPC:
         return BatchedPlans(controller, preview)
+    if type(controller) is Rounded or (type(controller) is DeadBand and controller.kind == "each"):
+        inner = _plans_of(controller.controller, preview, None)
+        return None if inner is None else BatchedRule(controller, preview, inner)
     if type(controller) is not MAMPC or type(controller.method) is not Exact:
         return None
     problem = controller.problem
@@ -208,4 +291,4 @@ def batched_plans(controller: Controller, preview: bool) -> BatchedPlans | None:
         return None
     n = controller.condensed.n_moves
     patterns = admissible.listed(LARGEST_TABLE // (n * (n + 1) // 2))
-    return None if patterns is None else BatchedExact(controller, preview, admissible, patterns)
+    return None if patterns is None else BatchedExact(controller, preview, admissible, patterns, like)

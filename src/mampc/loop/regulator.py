@@ -21,6 +21,8 @@ from mampc.program.daqp import active_flags
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.state_space import StateSpace
 
+USUAL_CHECKS = SensorChecks()
+
 
 class Regulator:
     """Output feedback: a controller fed by an estimator, which believes what passes the sensor checks.
@@ -71,7 +73,8 @@ class Regulator:
         self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
         self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
         self.estimator = default_estimator(controller.problem) if estimator is None else estimator
-        self._sensors = (SensorChecks() if sensors is None else sensors).fitted(controller.problem)
+        self.sensors = USUAL_CHECKS if sensors is None else sensors
+        self._sensors = self.sensors.fitted(controller.problem)
         self._v_shape = (model.n_disturbances,)
         tolerance = None
         if applied_tolerance is not None:

@@ -87,14 +87,14 @@ class DeadBand(Rule):
             raise MampcError(f"size: expected values of at least 0, received {size!r}")
         if kind not in BANDS:
             raise MampcError(f"kind: expected one of {', '.join(BANDS)}, received {kind!r}")
-        self._kind = kind
+        self.kind = kind
 
     def chosen(self, wanted: Array, u: Array) -> Array:
         change, size = np.abs(wanted - u), self._size
         beyond: Any = change > size
-        if self._kind == "any":
+        if self.kind == "any":
             beyond = beyond.any()
-        elif self._kind == "norm":
+        elif self.kind == "norm":
             beyond = (change[size == 0] > 0).any() or np.hypot.reduce(change[size > 0] / size[size > 0]) > 1
         return np.where(beyond, wanted, u)
 
