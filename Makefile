@@ -24,8 +24,8 @@ demo: .venv/run.stamp  ## run the quadruple-tank study: a table, results/quadrup
 test: .venv/dev.stamp  ## run the tests
 	$(PYTEST) $(PYTEST_ARGS)
 
-deep: .venv/dev.stamp  ## run the seeds that `make test` leaves out
-	$(PYTEST) -m slow $(PYTEST_ARGS)
+deep: .venv/dev.stamp  ## run all tests, with every seed and example
+	MAMPC_DEEP=1 $(PYTEST) -m "" $(PYTEST_ARGS)
 
 coverage: .venv/dev.stamp  ## run the tests and show which branches none of them takes
 	$(PYTEST) --cov --cov-report=term-missing:skip-covered $(PYTEST_ARGS)

@@ -16,10 +16,11 @@ from hypothesis import HealthCheck, Phase, settings
 from builders import load_bank
 from mampc.program.daqp import DaqpSolver
 from mampc.program.qp import UNBOUNDED, QPStatus
+from seeds import examples
 
 # For tests/test_fuzz.py alone; other tests keep the settings that they state.
 settings.register_profile(
-    "short", max_examples=100, stateful_step_count=20, deadline=None, derandomize=True,
+    "short", max_examples=examples(100, quick=40), stateful_step_count=20, deadline=None, derandomize=True,
     phases=[Phase.explicit, Phase.generate],  # shrinking takes many minutes; `make fuzz` does it
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip

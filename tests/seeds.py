@@ -1,8 +1,17 @@
-"""Seeds of random tests: the first ones run always, the deep ones with `make deep`."""
+"""How deep random tests go: the first seeds and a few examples always, all of them with `make deep`."""
+
+import os
 
 import pytest
+
+DEEP = bool(os.environ.get("MAMPC_DEEP"))  # set by `make deep`
 
 
 def seeds(count, *, quick):
     """0..count-1, those from `quick` on marked slow."""
     return [*range(quick), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(quick, count))]
+
+
+def examples(count, *, quick):
+    """So many for tests by property, and for those that need many seeds in one."""
+    return count if DEEP else quick

@@ -12,6 +12,7 @@ import mampc
 from builders import identified_tank, random_model, tank_problem
 from mampc import Remark, Status
 from mampc.loop.actuators import Actuators
+from seeds import examples
 
 pytestmark = pytest.mark.usefixtures("either_estimator")
 
@@ -191,7 +192,7 @@ TOLD = st.one_of(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200, quick=60), deadline=None)
 @given(
     samples=st.lists(
         st.tuples(TOLD, st.integers(1, 12), st.booleans(), st.lists(st.integers(-3, 3), min_size=1)),

@@ -11,13 +11,14 @@ import mampc
 from builders import cost_of_inputs, fading, predicted, random_model, violation_scale
 from mampc import Remark
 from referees import charge
+from seeds import examples
 
 SETTINGS = {
     "alternating": {"polish": True, "warm_up": 0}, "as in the paper": {"warm_up": 1},
     "admm": {"starts": 3, "iterations": 10}, "reweighted_l1": {"reweightings": 1, "bisections": 6},
 }  # fmt: skip
 METHODS = ["mpc", "as in the paper", *mampc.METHODS]
-SEEDS = range(40)
+SEEDS = range(examples(40, quick=14))
 
 
 def random_limits(rng, model, n_c):

@@ -7,6 +7,7 @@ import pytest
 import mampc
 from builders import fading, identified_tank, predicted, random_model, tank_problem, violation_scale
 from mampc import Remark, Status
+from seeds import seeds
 
 EITHER = pytest.mark.usefixtures("either_estimator")
 
@@ -69,7 +70,7 @@ def best_by_cvxpy(problem, limits, x, u_previous, reference, pattern):
     return problem_.value if problem_.status == "optimal" else np.inf
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", seeds(12, quick=3))
 def test_limits_that_vary_over_the_horizon_are_those_of_the_optimum(seed):
     """Every pattern with at most two moves by an independent solver against the exact search; and plain MPC."""
     rng, problem = np.random.default_rng(seed), random_problem(seed)

@@ -18,6 +18,7 @@ from mampc import IOData, MampcError, StateSpace, n4sid, prbs, validate
 from mampc.identification.realisation import realise
 from mampc.identification.subspace import hankel_factor, observability
 from random_systems import markov, noise_free, noisy_record, random_system, system_with
+from seeds import examples
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
 SIZES = [(2, 1, 1), (4, 2, 2), (5, 2, 3)]  # states, inputs, outputs
@@ -195,9 +196,9 @@ METHODS = {
 
 @lru_cache
 def median_fits(name):
-    """Per method, the median over six records of the hold-out fit."""
+    """Per method, the median over some records of the hold-out fit."""
     system = system_with(SIMULATED[name], seed=100)
-    records = [noisy_record(system, seed) for seed in range(6)]
+    records = [noisy_record(system, seed) for seed in range(examples(6, quick=3))]
     medians = {
         method: float(np.median([validate(identify(data), unseen).fit.mean() for data, unseen in records]))
         for method, identify in METHODS.items()
@@ -258,6 +259,7 @@ MEMORY_PROBE = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of resident memory is read from /proc")
 def test_memory_stays_small_and_grows_at_most_linearly_with_the_record():
     command = [sys.executable, "-c", textwrap.dedent(MEMORY_PROBE)]
