@@ -12,7 +12,7 @@ import mampc
 from builders import identified_tank, random_model, tank_problem
 from mampc import Hypothesis, LoadBank, LoadKind
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
-from mampc.loop.load_bank import FORGETS, JUMP_GOES_ON, LEAST, STAYS, TO_JUMP
+from mampc.loop.load_bank import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.noise import Noise
 from mampc.systems.riccati import predicted_covariance, seen_covariance
 
@@ -91,7 +91,8 @@ def naive(bank, estimate, drive, surplus):
                 T[a, b] = STAYS
             else:
                 T[a, b] = TO_JUMP if jumps[b] else (1 - STAYS - TO_JUMP) / (B - 2)
-    c, members, likelihood = mu @ T, [], []
+    c, members, likelihood, surprise = mu @ T, [], [], []
+    variance, seen = estimate.scale
     for b, member in enumerate(bank.members):
         z = sum(mu[a] * T[a, b] * estimate.members[a] for a in range(B)) / c[b]
         z = member.A @ z
@@ -99,10 +100,13 @@ def naive(bank, estimate, drive, surplus):
         e = surplus - member.C @ z
         S = member.C @ member.covariance @ member.C.T + member.noise
         members.append(z + member.covariance @ member.C.T @ np.linalg.solve(S, e))
-        likelihood.append(np.exp(-0.5 * e @ np.linalg.solve(S, e)) / np.sqrt(np.linalg.det(S)))
+        surprise.append(e @ np.linalg.solve(S, e))
+        likelihood.append(np.exp(-0.5 * surprise[-1] / variance) / np.sqrt(np.linalg.det(S)))
     mu = c * likelihood / (c @ likelihood)
     usual = np.maximum((1 - FORGETS) * usual + FORGETS * mu, LEAST) * ~np.array(jumps)
-    return np.array(members), mu, usual / usual.sum()
+    seen = min(seen + 1, NOISE_REMEMBERED)
+    variance += (min(mu @ surprise / len(surplus), UNUSUAL * variance) - variance) / seen
+    return np.array(members), mu, usual / usual.sum(), [variance, seen]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -116,7 +120,7 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
         y = model.y_op + 0.3 * rng.standard_normal(model.n_outputs)
         drive = model.B @ np.concatenate([u - model.u_op, last_v - model.v_op])
         surplus = y - model.y_op - model.D @ np.concatenate([u - model.u_op, v - model.v_op])
-        members, weights, usual = naive(bank, estimate, drive, surplus)
+        members, weights, usual, scale = naive(bank, estimate, drive, surplus)
         predicted = bank.predict(estimate, u, last_v)
         innovation = bank.innovation(predicted, u, y, v)
         updated, corrected = bank.update(estimate, u, y, last_v, v), bank.corrected(predicted, innovation)
@@ -124,6 +128,7 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
         for one in (updated.estimate, corrected):
             np.testing.assert_allclose(one.weights, weights, rtol=1e-6, atol=1e-12)
             np.testing.assert_allclose(one.usual, usual, rtol=1e-6)
+            np.testing.assert_allclose(one.scale, scale, rtol=1e-6)
             np.testing.assert_allclose(one.members, members, rtol=1e-6, atol=1e-6 * np.abs(members).max())
         estimate = updated.estimate
 
@@ -299,6 +304,8 @@ def test_hypotheses_can_be_chosen_and_one_is_a_plain_filter():
         ({"members": [[0.0] * 3] * 6}, "shape"),
         ({"members": [[0.0] * 12] * 2}, "shape"),
         ({"weights": None}, "received"),
+        ({"scale": [0.0, 10.0]}, "estimate.scale"),
+        ({"scale": [1.0]}, "shape"),
     ],
     ids=str,
 )
@@ -393,3 +400,22 @@ def test_every_method_plans_with_loads_that_fade(method):
     np.testing.assert_allclose(one.plan, two.plan, atol=1e-6)
     assert one.status == two.status
     assert pickle.loads(pickle.dumps(other)).with_model(problem.model).problem.model is problem.model
+
+
+@pytest.mark.parametrize("told", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("load", ["none", "steps", "walk"])
+def test_noise_that_is_told_wrongly_is_found_out(told, load):
+    problem, tank = tank_problem(), mampc.plants.QuadrupleTank()
+    loop = mampc.Regulator(mampc.MPC(problem), LoadBank(problem.model, noise=told))
+    acting = {
+        "none": [], "steps": [mampc.loads.RandomSteps(size=4.0, every=600.0)],
+        "walk": [mampc.loads.RandomWalk(size=0.3)],
+    }[load]  # fmt: skip
+    reference = np.tile(problem.model.y_op, (300, 1))
+    run = mampc.simulate(tank, loop, reference, noise=0.1, seed=1, loads=acting, progress=False)
+    state = loop.initial_state(run.u_initial)
+    for y, r in zip(run.y_measured, run.r, strict=True):
+        state = loop.step(state, y, r).state
+    variance, seen = state.estimate.scale
+    assert seen == NOISE_REMEMBERED
+    assert 0.1 / 1.5 < told * np.sqrt(variance) < 0.1 * 1.5

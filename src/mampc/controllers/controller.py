@@ -142,7 +142,8 @@ class Controller(ABC):
                 i = 1..np. Inputs stay within the limits of the problem too, outputs have these instead.
             manual: which inputs somebody else moves now, bool, shape (m,); they are planned to stay where they are,
                 beyond their limits too.
-            hypotheses: how likely each hypothesis about the loads is, shape (B,), for plans that count on later data.
+            hypotheses: how much what each hypothesis about the loads will tell counts, shape (B,), for plans that count
+                on later data.
 
         Returns:
             A `Decision`. Numbers that `is_usable` refuses lead to a held input and a status, not to an error.

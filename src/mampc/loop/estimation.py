@@ -119,7 +119,7 @@ class Estimator(ABC):
         return None
 
     def weights_of(self, estimate: Estimate) -> Array | None:
-        """How likely each hypothesis is, shape (B,), or loops first, (S, B); None for estimators without any."""
+        """How much the `shifts` of each hypothesis count now, shape (B,), or loops first, (S, B); None without any."""
         return None
 
     def load(self, estimate: Estimate) -> LoadKind | None:

@@ -6,7 +6,8 @@ mixture of all that may have led to them:
 
     c_b = sum_a mu_a T_ab      z_b <- sum_a mu_a T_ab z_a / c_b      mu_b ~ c_b N(e_b; 0, S_b)
 
-with the innovation e_b of filter b and its covariance S_b.
+with the innovation e_b of filter b and its covariance S_b. These hold up to one factor, which the innovations of late
+tell: loads are told in units of the noise, so noise that was told wrongly changes no gain.
 
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
@@ -32,6 +33,12 @@ TO_JUMP = 0.001  # chance that it jumps; what is left goes to the other hypothes
 JUMP_GOES_ON = 0.3  # chance that a jump takes one more sample
 FORGETS = 0.01  # share by which a sample counts in what usually holds
 LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
+NOISE_TOLD, NOISE_REMEMBERED = (
+    10.0,
+    100.0,
+)  # samples' worth of what is told of the noise, and of what is seen of it
+NOISE_RANGE = (1e-4, 1e4)  # of the variance, beside what was told
+UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
 IMPOSSIBLE = 1e-300  # no hypothesis is less likely, so that some are left whatever comes
@@ -50,11 +57,13 @@ class BankEstimate(Estimate):
         members: z of each hypothesis, shape (B, n + 2k).
         weights: how likely each hypothesis is, shape (B,), with sum 1.
         usual: how likely each one is on average of the samples without jumps, shape (B,), with sum 1.
+        scale: variance of the innovations beside what the noise told leads to, and how many samples have shown it.
     """
 
     members: Array
     weights: Array
     usual: Array
+    scale: Array
 
 
 class Filters(NamedTuple):
@@ -64,11 +73,13 @@ class Filters(NamedTuple):
         gains: shape (B, n + 2k, l).
         whiten: W with |W e|^2 = e' S^-1 e, shape (B, l, l).
         log_scale: -1/2 log det S, shape (B,).
+        believed: how many outputs are.
     """
 
     gains: Array
     whiten: Array
     log_scale: Array
+    believed: int
 
 
 class LoadBank(Estimator):
@@ -79,8 +90,9 @@ class LoadBank(Estimator):
     Args:
         model: a discrete model.
         noise: standard deviation of the measurement noise of each output, scalar or (l,), in output units. Twice
-            too large, loads are found later; twice too small, noise is taken for loads. Default: what the record of an
-            identified model showed (`model.noise`); see `for_problem` for a guess.
+            too large, loads are found later, and twice too small, noise is taken for loads, until some hundred samples
+            have shown how large it is. Default: what the record of an identified model showed (`model.noise`); see
+            `for_problem` for a guess.
         hypotheses: about the load, at least one; see `HYPOTHESES`.
 
     Raises:
@@ -176,8 +188,9 @@ class LoadBank(Estimator):
         return np.tile(np.stack(shifts)[:, None], (1, samples, 1, 1))
 
     def weights_of(self, estimate: Estimate) -> Array:
-        """See `Estimator.weights_of`."""
-        return _bank(estimate).weights
+        """How likely each hypothesis is, times the variance of the noise beside what was told."""
+        bank = _bank(estimate)
+        return bank.weights * bank.scale[..., :1]
 
     def load(self, estimate: Estimate) -> LoadKind:
         """The hypothesis that is the most likely one, in words."""
@@ -197,7 +210,7 @@ class LoadBank(Estimator):
         members = bank.members.copy()
         members[:, n : n + self.loads.count] = loads[int(stuck.argmax())]
         members[:, n + self.loads.count :] = 0.0
-        return self._estimate(members, bank.weights, bank.usual)
+        return self._estimate(members, bank.weights, bank.usual, bank.scale)
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
         """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
@@ -220,7 +233,7 @@ class LoadBank(Estimator):
             x = np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
         usual = self._lasts / self._lasts.sum()
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
-        return self._estimate(members, usual @ self._chances, usual)
+        return self._estimate(members, usual @ self._chances, usual, np.array([1.0, NOISE_TOLD]))
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
@@ -238,7 +251,7 @@ class LoadBank(Estimator):
             return None
         each = each.reshape(len(c), -1)
         seen = c.dot(each[:, n_z:-l])  # innovation and movement of the mixture
-        estimate = self._weighed(each[:, :n_z], c, bank.usual, each[:, -l:], self.filters(self._all))
+        estimate = self._weighed(each[:, :n_z], c, bank, each[:, -l:], self.filters(self._all))
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
@@ -251,9 +264,7 @@ class LoadBank(Estimator):
             each = np.matmul(self._of_states, mixed[..., None])[..., 0]
             each += (known @ self._of_known.T).reshape(len(y), hypotheses, -1)
             seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:-l])
-            estimate = self._weighed(
-                each[:, :, :n_z], c, bank.usual, each[:, :, -l:], self.filters(self._all)
-            )
+            estimate = self._weighed(each[:, :, :n_z], c, bank, each[:, :, -l:], self.filters(self._all))
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
     def _everyday(self) -> tuple[Array, Array]:
@@ -283,7 +294,7 @@ class LoadBank(Estimator):
         c, mixed = self._mixed(bank)
         members = np.matmul(self._A, mixed[:, :, None])[:, :, 0]
         members[:, : model.n_states] += model.B @ self._change(u, v)
-        return self._estimate(members, c, bank.usual)
+        return self._estimate(members, c, bank.usual, bank.scale)
 
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
         """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
@@ -301,7 +312,7 @@ class LoadBank(Estimator):
         each = np.where(believed, innovation, 0.0) + bank.weights @ seen - seen
         members = bank.members + np.matmul(filters.gains, each[:, :, None])[:, :, 0]
         white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
-        return self._weighed(members, bank.weights, bank.usual, white, filters)
+        return self._weighed(members, bank.weights, bank, white, filters)
 
     def filters(self, believed: BoolArray) -> Filters:
         """The gains where only some outputs, bool (l,), are believed."""
@@ -315,7 +326,7 @@ class LoadBank(Estimator):
                 whiten[b][np.ix_(believed, believed)] = np.linalg.inv(root)
                 log_scale[b] = -np.log(np.diag(root) / self.noise[believed]).sum()
             gains = np.stack([member.gain(believed) for member in self.members])
-            filters = self._filters[key] = Filters(gains, whiten, log_scale)
+            filters = self._filters[key] = Filters(gains, whiten, log_scale, int(believed.sum()))
         return filters
 
     def _mixed(self, bank: BankEstimate) -> tuple[Array, Array]:
@@ -325,22 +336,29 @@ class LoadBank(Estimator):
         return c, np.matmul(joint.swapaxes(-1, -2), bank.members) / c[..., None]
 
     def _weighed(
-        self, members: Array, c: Array, usual: Array, white: Array, filters: Filters
+        self, members: Array, c: Array, bank: BankEstimate, white: Array, filters: Filters
     ) -> BankEstimate:
         """The estimate after Bayes' rule, from the innovations made white, shape (..., B, l)."""
-        likelihood = filters.log_scale - 0.5 * np.einsum("...bi,...bi->...b", white, white)
+        surprise = np.einsum("...bi,...bi->...b", white, white)
+        likelihood = filters.log_scale - 0.5 * surprise / bank.scale[..., :1]
         weights = c * np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
         weights /= weights.dot(self._ones)[..., None]
-        usual = np.maximum((1 - FORGETS) * usual + FORGETS * weights, LEAST) * self._lasts
+        usual = np.maximum((1 - FORGETS) * bank.usual + FORGETS * weights, LEAST) * self._lasts
         usual /= usual.dot(self._ones)[..., None]
-        return self._estimate(members, weights, usual)
+        if not filters.believed:
+            return self._estimate(members, weights, usual, bank.scale)
+        variance, seen = bank.scale[..., 0], np.minimum(bank.scale[..., 1] + 1, NOISE_REMEMBERED)
+        shown = np.einsum("...b,...b->...", weights, surprise) / filters.believed
+        variance = variance + (np.clip(shown, 0.0, UNUSUAL * variance) - variance) / seen
+        scale = np.stack([np.clip(variance, *NOISE_RANGE), seen], axis=-1)
+        return self._estimate(members, weights, usual, scale)
 
-    def _estimate(self, members: Array, weights: Array, usual: Array) -> BankEstimate:
+    def _estimate(self, members: Array, weights: Array, usual: Array, scale: Array) -> BankEstimate:
         shape = (*weights.shape[:-1], -1)
         plan = (weights[..., None] * members).reshape(shape).dot(self._mixture)
         l, m = self.model.n_outputs, self.model.n_inputs
         return BankEstimate(
-            plan[..., : -m - l], plan[..., -l:], plan[..., -m - l : -l], members, weights, usual
+            plan[..., : -m - l], plan[..., -l:], plan[..., -m - l : -l], members, weights, usual, scale
         )
 
     def _seen(self, members: Array) -> Array:

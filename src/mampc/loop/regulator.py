@@ -147,6 +147,9 @@ class Regulator:
             shares = getattr(state.estimate, name, np.ones(1))
             if (shares < 0).any() or not abs(shares.sum() - 1) < 1e-9:
                 raise MampcError(f"state: expected estimate.{name} that sum up to 1, received {shares}")
+        scale = getattr(state.estimate, "scale", np.ones(1))
+        if not (scale > 0).all():
+            raise MampcError(f"state: expected positive numbers at estimate.scale, received {scale}")
         if not active_flags(state.controller.active):
             raise MampcError(
                 f"state: expected flags at controller.active, received {state.controller.active}"
