@@ -219,7 +219,7 @@ def run(quick: bool, jobs: int, plants: list[str], again: list[str]) -> None:
         journals[method] = Journal(path, hashlib.sha256(constants.encode()).hexdigest()[:16])
     work = [(name, kind) for kind in LOADS for name in cases() if not plants or name in plants]
     missing = [
-        (*where, method) for where in work for method in METHODS if str(where) not in journals[method].done
+        (*where, method) for method in METHODS for where in work if str(where) not in journals[method].done
     ]
     began = time.time()
     parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
