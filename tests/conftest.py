@@ -1,6 +1,7 @@
 """Every optimal solve of every test is checked for its optimality conditions."""
 
 import os
+import shutil
 import sys
 
 # Before NumPy is there: tests run one process a core, and more threads than cores only wait for each other.
@@ -102,3 +103,20 @@ def either_estimator(request, monkeypatch):
     if request.param == "load bank":
         monkeypatch.setattr("mampc.loop.regulator.default_estimator", load_bank)
     return request.param
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Chromium without a window; skipped where there is none."""
+    driver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
+    chromium, chromedriver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or chromedriver is None:
+        pytest.skip("needs chromium and chromedriver: apt-get install chromium chromium-driver")
+    options = driver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = driver.Chrome(options=options, service=driver.ChromeService(chromedriver))
+    yield browser
+    browser.quit()

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -135,22 +134,6 @@ def test_a_run_writes_its_page_or_says_how_to_get_it(tmp_path, monkeypatch):
 )
 def test_numbers_are_said_to_two_digits(value, text):
     assert interactive._number(value) == text
-
-
-@pytest.fixture(scope="module")
-def browser():
-    driver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
-    chromium, chromedriver = shutil.which("chromium"), shutil.which("chromedriver")
-    if chromium is None or chromedriver is None:
-        pytest.skip("needs chromium and chromedriver: apt-get install chromium chromium-driver")
-    options = driver.ChromeOptions()
-    options.binary_location = chromium
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    browser = driver.Chrome(options=options, service=driver.ChromeService(chromedriver))
-    yield browser
-    browser.quit()
 
 
 @pytest.fixture(params=[1280, 390])

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mampc.base.errors import MampcError
 from mampc.cli.app import app
 from mampc.cli.console import bar, complain, console_for_tables
+
+if TYPE_CHECKING:
+    from mampc.compare.sweep import Sweep
 
 LARGE_SWEEP = 20_000  # runs of a sweep that asks first
 
@@ -46,7 +49,7 @@ def sweep(
     """
     from mampc.report.fronts import write_rows
 
-    rows, folder = _swept(study, out, seeds, points, jobs, scheduler, yes, trust)
+    _, rows, folder = _swept(study, out, seeds, points, jobs, scheduler, yes, trust)
     write_rows(rows, folder / table)
     console_for_tables().print(f"{len(rows)} runs are in {folder / table}", soft_wrap=True, markup=False)
 
@@ -71,17 +74,19 @@ def front(
 ) -> None:
     """Which controller needs the fewest moves at equal tracking error? Runs the sweep, then draws and tabulates.
 
+    Writes report.html too, one page to send on: a slider along the fronts changes the trajectories that it shows.
     Takes what `mampc sweep` has finished in the same folder and runs what is missing.
 
     Example:
 
         mampc front quadruple-tank --seeds 16 --out results/tank-front
     """
+    from mampc.report.front_page import write_front_page
     from mampc.report.fronts import front_figure, front_tables, scenarios_of, write_rows
     from mampc.report.output import save_figure
     from mampc.study.schema import file_word
 
-    rows, folder = _swept(study, out, seeds, points, jobs, scheduler, yes, trust)
+    plan, rows, folder = _swept(study, out, seeds, points, jobs, scheduler, yes, trust)
     write_rows(rows, folder / "sweep.csv")
     console = console_for_tables()
     for found in front_tables(rows):
@@ -92,6 +97,11 @@ def front(
             save_figure(front_figure(rows, scenario), folder / f"{file_word(scenario)}_front")
     except MampcError as error:
         complain(f"note: no figures written; {error}")
+    try:
+        with bar("report.html") as show:
+            write_front_page(plan, rows, folder, show)
+    except MampcError as error:
+        complain(f"note: no report.html written; {error}")
     console.print(f"Results are in {folder}", soft_wrap=True, markup=False)
 
 
@@ -104,8 +114,8 @@ def _swept(
     scheduler: str | None,
     yes: bool,
     trust: bool,
-) -> tuple[list[dict[str, Any]], Path]:
-    """The rows of a sweep, and the folder that holds its results."""
+) -> tuple[Sweep, list[dict[str, Any]], Path]:
+    """A sweep, its rows, and the folder that holds its results."""
     from time import perf_counter
 
     from mampc.compare.sweep import Sweep, run_sweep, run_task
@@ -124,4 +134,4 @@ def _swept(
             raise typer.Exit(1)
     with bar(source) as show:
         rows = run_sweep(plan, folder, jobs=jobs, scheduler=scheduler, on_task=show)
-    return rows, folder
+    return plan, rows, folder

@@ -9,7 +9,8 @@ from __future__ import annotations
 import html
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -49,6 +50,7 @@ _PAGE = """<!doctype html>
 <fieldset id="scenarios"></fieldset>
 <p id="sentence" aria-live="polite">{sentence}</p>
 <div id="tradeoff"></div>
+<p class="note">{means}</p>
 <div class="slider"><span>fewest moves</span>
 <input id="slider" type="range" min="0" max="0" step="1" aria-label="controller, from fewest moves to most">
 <span>most moves</span></div>
@@ -75,15 +77,37 @@ joined; to the left are fewer moves, further down is a smaller error.</p>
 """
 
 
-def interactive_page(result: StudyResult) -> str:
-    """The text of report.html.
+@dataclass(frozen=True)
+class Means:
+    """What a page says of moves and error where single runs would mislead: means over runs under many seeds.
+
+    Attributes:
+        study: whose settings the page tells.
+        points: scenario -> controller -> moves a day and tracking error.
+        group: controller -> what it is a setting of; none for the baseline.
+        first: scenario -> the controller that is shown first.
+        told: what they are means over, a sentence.
+        note: on controllers without a setting on the page, sentences.
+    """
+
+    study: Study
+    points: Mapping[str, Mapping[str, tuple[float, float]]]
+    group: Mapping[str, str]
+    first: Mapping[str, str]
+    told: str
+    note: str = ""
+
+
+def interactive_page(result: StudyResult, means: Means | None = None) -> str:
+    """The text of report.html, of single runs, or of settings with the means of many.
 
     Raises:
         MampcError: plotly is missing.
     """
     study, web = result.study, files("mampc.report").joinpath("web")
+    kind = "controllers" if means is None else "settings"
     plotly = _plotly()
-    content, step = _content(result)
+    content, step = _content(result, means)
     seconds = study.steps * study.dt
     first = content["scenarios"][0]
     identified = result.identified
@@ -97,7 +121,8 @@ def interactive_page(result: StudyResult) -> str:
         shown += f" Of every {step} samples the smallest and the largest value are shown."
     parts = {
         "title": f"{study.name}: fewer moves, and what they cost",
-        "subtitle": f"{len(study.controllers)} controllers on {_words(names.inputs)} and {_words(names.outputs)}, "
+        "means": "" if means is None else f"{means.told} {means.note}".strip(),
+        "subtitle": f"{len(study.controllers)} {kind} on {_words(names.inputs)} and {_words(names.outputs)}, "
         f"{study.steps} samples of {_duration(study.dt)}. The model has {result.model.n_states} states"
         + (f" and explains {fit} in the record it comes from." if fit else "."),
         "sentence": first["choices"][first["first"]]["sentence"],
@@ -116,7 +141,7 @@ def interactive_page(result: StudyResult) -> str:
         wear="".join(f"<th>{cell}</th>" for cell in _WEAR),
         tables=_tables(result, content),
         statuses=_statuses(result),
-        settings=html.escape("\n".join(_settings(study))),
+        settings=html.escape("\n".join(_settings(study if means is None else means.study))),
     )
 
 
@@ -129,7 +154,7 @@ def _plotly() -> str:
     return script.replace("</script", "<\\/script")
 
 
-def _content(result: StudyResult) -> tuple[dict[str, Any], int]:
+def _content(result: StudyResult, means: Means | None) -> tuple[dict[str, Any], int]:
     """What the script shows, and how many samples stand behind each one shown."""
     study = result.study
     first = next(iter(next(iter(result.runs.values())).values()))
@@ -138,10 +163,15 @@ def _content(result: StudyResult) -> tuple[dict[str, Any], int]:
     lines = sum(signals * len(runs) + len(first.names.outputs) for runs in result.runs.values())
     step = -(-len(first.t) // max(MOST_NUMBERS // lines // 2, 1))
     step = 1 if step <= 2 else step
-    favourite = [*result_looks(result), ""][1]
-    scenarios = [_scenario(study, name, runs, favourite, scale, step) for name, runs in result.runs.items()]
+    favourite = [*result_looks(result), ""][1] if means is None else ""
+    scenarios = [
+        _scenario(study, name, runs, means.first[name] if means else favourite, scale, step, means)
+        for name, runs in result.runs.items()
+    ]
     content = {
-        "x": f"moves a day above {study.threshold:g}",
+        "x": f"moves a day above {study.threshold:g}" if means is None else "moves a day",
+        "log": means is not None
+        and all(x > 0 for points in means.points.values() for x, _ in points.values()),
         "y": "tracking error, mean |y − r|²",
         "unit": unit,
         "scenarios": scenarios,
@@ -150,10 +180,21 @@ def _content(result: StudyResult) -> tuple[dict[str, Any], int]:
 
 
 def _scenario(
-    study: Study, name: str, runs: dict[str, Run], favourite: str, scale: float, step: int
+    study: Study,
+    name: str,
+    runs: dict[str, Run],
+    favourite: str,
+    scale: float,
+    step: int,
+    means: Means | None,
 ) -> dict[str, Any]:
     metrics = {controller: run.metrics(threshold=study.threshold) for controller, run in runs.items()}
-    order = sorted(runs, key=lambda controller: (_a_day(metrics[controller], study.dt).sum(), controller))
+    points: Mapping[str, tuple[float, float]] = {
+        c: (float(_a_day(m, study.dt).sum()), m.tracking_error) for c, m in metrics.items()
+    }
+    if means is not None:
+        points = means.points[name]
+    order = sorted(runs, key=lambda controller: (points[controller], controller))
     base = baseline(study).name
     first = runs[base]
     names = first.names
@@ -176,7 +217,6 @@ def _scenario(
                 "range": [min(ends), max(ends)],
             })  # fmt: skip
             reference.append(_thinned(first.r[:, i], step) if output else None)
-    points = {c: (float(_a_day(m, study.dt).sum()), m.tracking_error) for c, m in metrics.items()}
     choices = []
     for controller in order:
         x, y = points[controller]
@@ -184,7 +224,8 @@ def _scenario(
         run = runs[controller]
         choices.append({
             "name": controller, "x": x, "y": y, "best": not better,
-            "sentence": _sentence(study, metrics, controller, base),
+            "group": "" if means is None else means.group.get(controller, ""),
+            "sentence": _sentence(points, controller, base),
             "short": f"{_number(x)} moves a day, error {_number(y, 3)}",
             "wear": list(_wear(run, metrics[controller], study.dt)),
             "signals": [_thinned(column, step) for column in np.hstack([run.y, run.u]).T],
@@ -207,13 +248,12 @@ def _thinned(values: Array, step: int) -> list[float]:
     return [round(float(value), 4 - int(np.floor(np.log10(spread)))) for value in values]
 
 
-def _sentence(study: Study, metrics: dict[str, Metrics], controller: str, base: str) -> str:
+def _sentence(points: Mapping[str, tuple[float, float]], controller: str, base: str) -> str:
     """What a controller saves, and at what error."""
-    moves = {name: _number(float(_a_day(metrics[name], study.dt).sum())) for name in (controller, base)}
-    own, other = metrics[controller].tracking_error, metrics[base].tracking_error
+    (moves, own), (usual, other) = points[controller], points[base]
     if controller == base:
         return (
-            f"{base}, which the others are compared with: {moves[base]} moves a day, "
+            f"{base}, which the others are compared with: {_number(usual)} moves a day, "
             f"tracking error {_number(own, 3)}."
         )
     error = (
@@ -221,7 +261,7 @@ def _sentence(study: Study, metrics: dict[str, Metrics], controller: str, base: 
         if other > 0
         else f"a tracking error of {_number(own, 3)}"
     )
-    return f"{controller}: from {moves[base]} moves a day to {moves[controller]}, with {error}."
+    return f"{controller}: from {_number(usual)} moves a day to {_number(moves)}, with {error}."
 
 
 def _a_day(metrics: Metrics, dt: float) -> Array:

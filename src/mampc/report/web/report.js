@@ -7,6 +7,7 @@ const touch = window.matchMedia("(pointer: coarse)").matches; // where dragging 
 const buttonsShown = [["zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d", "toImage"]];
 const config = { responsive: true, displaylogo: false, modeBarButtons: buttonsShown };
 const font = { family: "system-ui, sans-serif", size: 12, color: "#222" };
+const HUES = ["#d55e00", "#009e73", "#cc79a7", "#8c6d1f", "#56b4e9", "#7a5195"]; // of groups, on the front
 const [GREY, BLUE, BLACK, PALE] = ["#5c5c5c", "#0072b2", "#000000", "#b9cbd6"];
 let scenario = 0, choice = 0;
 
@@ -33,30 +34,52 @@ function element(name, text, parent) {
   return made;
 }
 
+function decades(low, high) { // 1, 2, 5, 10, ... from below low to above high
+  const ticks = [];
+  for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power += 1) {
+    ticks.push(...[1, 2, 5].map((digit) => digit * 10 ** power));
+  }
+  return ticks;
+}
+
 function drawTradeoff() {
   const { choices, base } = content.scenarios[scenario];
   const best = choices.filter((one) => one.best);
-  const top = Math.max(...choices.map((one) => one.x)) || 1;
-  const colour = (i) => (i === choice ? BLUE : i === base ? GREY : PALE);
+  const top = Math.max(...choices.map((one) => one.x)) || 1, least = Math.min(...choices.map((one) => one.x));
+  const place = (x) => (content.log ? Math.log(x / least) / (Math.log(top / least) || 1) : x / top);
+  const groups = [...new Set(choices.map((one) => one.group).filter((group) => group))];
+  const hue = (group) => HUES[groups.indexOf(group) % HUES.length];
+  const colour = (i) => (i === choice ? BLUE : i === base ? GREY : choices[i].group ? hue(choices[i].group) : PALE);
   const points = {
     x: choices.map((one) => one.x), y: choices.map((one) => one.y), mode: "markers+text", cliponaxis: false,
     text: choices.map((one, i) => (i === choice || i === base ? short(one.name) : "")),
     textposition: choices.map((one, i) => {
-      const side = one.x < 0.2 * top ? "right" : one.x > 0.8 * top ? "left" : "center";
+      const side = place(one.x) < 0.2 ? "right" : place(one.x) > 0.8 ? "left" : "center";
       return (i === choice ? "top " : "bottom ") + side;
     }),
     marker: { size: choices.map((_, i) => (i === choice ? 15 : 11)), color: choices.map((_, i) => colour(i)), opacity: 1 },
     hovertext: choices.map((one) => plain(one.name, 40) + "<br>" + plain(one.short, 40)), hoverinfo: "text",
+    showlegend: false,
   };
   const line = {
     x: best.map((one) => one.x), y: best.map((one) => one.y), mode: "lines", hoverinfo: "skip",
-    line: { color: "#cccccc", width: 1.5, dash: "dot" },
+    line: { color: "#cccccc", width: 1.5, dash: "dot" }, showlegend: false,
   };
+  const fronts = groups.map((group) => {
+    const own = choices.filter((one) => one.group === group);
+    return {
+      x: own.map((one) => one.x), y: own.map((one) => one.y), mode: "lines", name: plain(group, 40), hoverinfo: "skip",
+      line: { color: hue(group), width: 1.5 },
+    };
+  });
   const axis = { rangemode: "tozero", gridcolor: "#ebebeb", zerolinecolor: "#999", automargin: true };
-  Plotly.react(tradeoff, [line, points], {
-    font, showlegend: false, dragmode: touch ? false : "zoom", hovermode: "closest", uirevision: scenario,
+  // The points come second, whatever is drawn beside them.
+  Plotly.react(tradeoff, [line, points, ...fronts], {
+    font, showlegend: groups.length > 0, legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" }, dragmode: touch ? false : "zoom", hovermode: "closest", uirevision: scenario,
     margin: { l: 50, r: 20, t: 10, b: 45 },
-    xaxis: { ...axis, title: { text: content.x }, range: [0, 1.12 * top] },
+    // Moves of fronts differ by factors.
+    xaxis: content.log ? { ...axis, rangemode: "normal", type: "log", title: { text: content.x }, tickvals: decades(least, top) }
+      : { ...axis, title: { text: content.x }, range: [0, 1.12 * top] },
     yaxis: { ...axis, title: { text: content.y } },
   }, { ...config, displayModeBar: false });
 }
