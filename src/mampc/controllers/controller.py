@@ -20,6 +20,7 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
+from mampc.program.daqp import active_bounds
 from mampc.program.limits_now import InputRange, LimitsNow, UsualLimits
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.sample import Indices, Sample
@@ -323,11 +324,11 @@ class Controller(ABC):
         if margins[margins.argmin()] > INSIDE:
             return Plan(sample.moves, Status.OPTIMAL, 0, None, None, sample.inputs, sample.cost)
         nearest = self.condensed.plain.solve(sample.moves, sample.lower, sample.upper, state.active)
-        if nearest.moves is None:
+        if nearest.moves is None or nearest.multipliers is None:
             return Plan(None, HELD_BY[nearest.status], nearest.iterations)
         return Plan(
             nearest.moves, Status.OPTIMAL, nearest.iterations, None, None, None, sample.cost + nearest.excess, (),
-            nearest.active, None, None if nearest.violated else self._no_violations,
+            active_bounds(nearest.multipliers), None, None if nearest.violated else self._no_violations,
         )  # fmt: skip
 
     def _unrestricted_but_frozen(self, sample: Sample, frozen: Indices) -> Plan:

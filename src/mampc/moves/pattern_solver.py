@@ -106,14 +106,12 @@ class PatternSolver:
         if within is not None:
             sizes, own = None, slice(restriction.n_violations, restriction.n_violations + len(within[0]))
             lower[own], upper[own] = np.maximum(lower[own], within[0]), np.minimum(upper[own], within[1])
-        if self._keeps(restriction, optimum, kept, sizes):
-            return self._answer(sample, pattern, optimum, base, cutoff, None, 0)
         nearest = restriction.solve(optimum, lower, upper)
         if nearest.moves is None or base + nearest.excess >= cutoff:
             failed = nearest.moves is None and nearest.status not in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA)
             bound = -np.inf if failed else base + nearest.excess
             return OnPattern(None, bound, nearest.status, nearest.multipliers, nearest.iterations)
-        if sizes is None:
+        if sizes is None or (nearest.moves is optimum and (np.abs(optimum) >= sizes).all()):
             return self._answer(
                 sample, pattern, nearest.moves, base + nearest.excess, cutoff, nearest.multipliers,
                 nearest.iterations,
@@ -142,14 +140,6 @@ class PatternSolver:
         if sample.bounds_now is None:
             return sample.lower, sample.upper
         return sample.bounds_now.on(pattern)
-
-    def _keeps(
-        self, restriction: Restriction, moves: Array, bounds: tuple[Array, Array], sizes: Array | None
-    ) -> bool:
-        """Whether moves keep all limits and least sizes as they are."""
-        rows, v = restriction.rows @ moves, self.condensed.n_violations
-        inside = (rows >= bounds[0][v:]).all() and (rows <= bounds[1][v:]).all()
-        return bool(inside and (sizes is None or (np.abs(moves) >= sizes).all()))
 
     def _answer(
         self,

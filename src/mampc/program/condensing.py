@@ -242,7 +242,10 @@ class CondensedQP:
             A least-squares problem in the moves: on any pattern, no moves that keep the limits cost less than its
             optimum there.
         """
-        delta, excess = self.plain.program.relaxed(sample.moves, sample.lower, sample.upper, multipliers)
+        program = self.plain.program
+        if sample.distances is None:
+            sample.distances = program.distances(sample.moves, sample.lower, sample.upper)
+        delta, excess = program.relaxed(sample.distances, multipliers)
         return LeastSquares(sample.target + delta, sample.cost + excess)
 
     def relaxed_limits(self, sample: Sample, multipliers: Array) -> tuple[Array, float]:

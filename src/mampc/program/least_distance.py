@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.program.daqp import ACTIVE_ABOVE, ACTIVE_BELOW, DaqpSolver, active_bounds
+from mampc.program.daqp import DaqpSolver
 from mampc.program.qp import QPSolution, QPStatus, QuadraticProgram
 from mampc.program.refinement import refined
 
@@ -40,7 +40,6 @@ class Nearest(NamedTuple):
     status: QPStatus
     iterations: int
     violated: bool = False  # whether some violation is above zero
-    active: Array | None = None  # bounds that hold the moves, flags of `DaqpSolver.start`, shape (bounds,)
 
 
 class LeastDistance:
@@ -88,12 +87,15 @@ class LeastDistance:
 
     def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
         """The best moves, given the optimum without limits, shape (k,), and all bounds, shape (v + b,)."""
-        low, high = self._from_optimum(optimum, lower, upper)
-        f, scale, v = self._f, self._scale(low, high), self._v
-        if scale != 1.0:
-            f = f / scale
-            low /= scale
-            high /= scale
+        low, high = self.distances(optimum, lower, upper)
+        far = self._far(low, high)
+        if far <= 0:
+            return Nearest(optimum, 0.0, np.zeros(len(low)), QPStatus.OPTIMAL, 0)
+        f, v, scale = self._f, self._v, 1.0
+        # Violations have a size of their own, 1: nothing smaller is enlarged then.
+        if far > (1.0 if v else 0.0) and isfinite(far):
+            scale = float(2.0 ** frexp(far)[1])
+            f, low, high = f / scale, low / scale, high / scale
         self._solver.start(active)
         solution = self._solver.solve(f, low, high)
         z, pull, status, iterations = solution
@@ -102,7 +104,7 @@ class LeastDistance:
                 return self._tried_again(optimum, lower, upper, solution)
             return Nearest(None, np.inf, None, status, iterations)
         delta = z[v:] * scale
-        excess, violated = float(delta.dot(delta)), bool(v and z[z[:v].argmax()] > 0)
+        excess, violated = float(delta.dot(delta)), v > 0 and max(z[:v].tolist()) > 0
         if violated:
             excess += self._penalty(z[:v] * (scale * self._per_violation))
         multipliers = pull * (scale * self._even)
@@ -110,14 +112,12 @@ class LeastDistance:
             slack = np.where(pull > 0, high, low)[v:] - self._A.dot(z)
             if scale * scale * np.abs(pull[v:]).dot(np.abs(slack)) > UNCERTAIN * excess:
                 return self._refined(optimum, lower, upper, multipliers, iterations)
-        moves, active = self._inverse.dot(delta), np.zeros(len(pull))
+        moves = self._inverse.dot(delta)
         moves += optimum
-        for i in pull.nonzero()[0].tolist():
-            above = pull[i] > 0
-            active[i] = ACTIVE_ABOVE if above else ACTIVE_BELOW
-            if v <= i < v + self._n_simple:
-                moves[i - v] = upper[i] if above else lower[i]
-        return Nearest(moves, excess, multipliers, status, iterations, violated, active)
+        for i, force in enumerate(pull[v : v + self._n_simple].tolist()):
+            if force:
+                moves[i] = (upper if force > 0 else lower)[v + i]
+        return Nearest(moves, excess, multipliers, status, iterations, violated)
 
     def _penalty(self, violations: Array) -> float:
         a = np.maximum(violations, 0.0)
@@ -164,36 +164,30 @@ class LeastDistance:
         excess, violated = float(delta.dot(delta)), bool(v and better.z[:v].max() > 0)
         if violated:
             excess += self._penalty(better.z[:v])
-        active = active_bounds(better.multipliers)
-        return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated, active)
+        return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated)
 
-    def relaxed(self, optimum: Array, lower: Array, upper: Array, multipliers: Array) -> tuple[Array, float]:
-        """The optimum with limits priced by multipliers: its delta, and its cost beyond that of the optimum without."""
-        low, high = self._from_optimum(optimum, lower, upper)
-        pull, v = multipliers / self._even, self._v
-        gradient = self._f + pull[v:].dot(self._A)
+    def relaxed(self, distances: tuple[Array, Array], multipliers: Array) -> tuple[Array, float]:
+        """The optimum with limits priced by multipliers: its delta, and its cost beyond that of the optimum without.
+
+        `distances` of the bounds, as `distances` gives them.
+        """
+        pull, v, (low, high) = multipliers / self._even, self._v, distances
+        gradient = pull[v:].dot(self._A)
+        gradient += self._f
         gradient[:v] += pull[:v]
-        excess = (
-            -0.25 * gradient.dot(gradient) - np.maximum(pull, 0.0).dot(high) - np.minimum(pull, 0.0).dot(low)
-        )
+        excess = -0.25 * gradient.dot(gradient) - pull.dot(np.where(pull > 0, high, low))
         return -0.5 * gradient[v:], float(excess)
 
-    def _from_optimum(self, optimum: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    def distances(self, optimum: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
         """The bounds as distances from the optimum."""
         low, high, reached = lower * self._even, upper * self._even, self._even_rows.dot(optimum)
         low[self._v :] -= reached
         high[self._v :] -= reached
         return low, high
 
-    def _scale(self, low: Array, high: Array) -> float:
-        """A power of two near the distance to go, which makes the solver's absolute tolerances relative.
-
-        Violations have a size of their own, 1: nothing smaller is enlarged then.
-        """
+    def _far(self, low: Array, high: Array) -> float:
+        """How far the optimum is from what it should keep; not above zero where it keeps all bounds."""
         if len(low) == self._v:
-            return 1.0
+            return 0.0
         low, high = low[self._v :], high[self._v :]
-        far = max(float(low[low.argmax()]), -float(high[high.argmin()]))
-        if not (isfinite(far) and far > (1.0 if self._v else 0.0)):
-            return 1.0
-        return float(2.0 ** frexp(far)[1])
+        return max(float(low[low.argmax()]), -float(high[high.argmin()]))

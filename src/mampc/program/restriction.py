@@ -86,13 +86,14 @@ class Restriction:
             active: bounds to start from, flags of `DaqpSolver.start`, shape (n_bounds,).
 
         Returns:
-            As `LeastDistance`, multipliers and active bounds being those of all bounds, shape (n_bounds,).
+            As `LeastDistance`, multipliers being those of all bounds, shape (n_bounds,).
         """
         if len(self.bounds) == self._n_bounds:
             return self.program.solve(optimum, lower, upper, active)
         nearest = self.program.solve(optimum, lower, upper, None if active is None else active[self.bounds])
         if nearest.multipliers is None:
             return nearest
-        multipliers, active = np.zeros(self._n_bounds), np.zeros(self._n_bounds)
-        multipliers[self.bounds], active[self.bounds] = nearest.multipliers, nearest.active
-        return nearest._replace(multipliers=multipliers, active=active)
+        multipliers = np.zeros(self._n_bounds)
+        multipliers[self.bounds] = nearest.multipliers
+        moves, excess, _, status, iterations, violated = nearest
+        return Nearest(moves, excess, multipliers, status, iterations, violated)

@@ -20,7 +20,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.program.condensing import ROUNDING, CondensedQP
-from mampc.program.sample import LaterData, LeastSquares, Optimum, PatternOptimum, Sample
+from mampc.program.sample import Indices, LaterData, LeastSquares, Optimum, PatternOptimum, Sample
 
 LARGEST_TABLE = 1_000_000  # entries; from here on the tree search is faster
 CACHE_BYTES = 64e6
@@ -32,6 +32,7 @@ class Ranking:
     Attributes:
         patterns: shape (K, n_moves).
         charge: their prices, shape (K,).
+        table: shape (K, n_moves (n_moves + 1) / 2).
     """
 
     def __init__(self, condensed: CondensedQP, admissible: AdmissiblePatterns, patterns: BoolArray) -> None:
@@ -52,11 +53,11 @@ class Ranking:
         if admissible.sized:
             self._optima, self._stiffness = np.zeros((len(patterns), n, n)), np.ones((len(patterns), n))
             self._sizes = np.where(self.patterns, admissible.min_size, 0.0)
-        self._table = np.empty((len(patterns), len(self._rows)))
+        self.table = np.empty((len(patterns), len(self._rows)))
         for k, pattern in enumerate(self.patterns):
             restriction = condensed.restricted(pattern)
             V = restriction.missed @ np.where(pattern, 0.0, unit_columns)
-            self._table[k] = (V.T @ V)[self._rows, self._columns] * doubled
+            self.table[k] = (V.T @ V)[self._rows, self._columns] * doubled
             if admissible.sized:
                 self._optima[k, pattern] = restriction.optimum(unit_columns)
                 inverse = np.linalg.inv(restriction.R)
@@ -84,15 +85,14 @@ class Ranking:
         """
         x = free * self.condensed.lengths
         rows = self.rows(past)
-        values: Array = self._table[rows].dot(x.take(self._rows) * x.take(self._columns))
-        # No entry of the table is larger than 1, so this is all that rounding can add.
-        values += least - len(x) * ROUNDING * float(x.dot(x))
+        values: Array = self.table[rows].dot(x.take(self._rows) * x.take(self._columns))
+        values += least - len(x) * ROUNDING * float(x.dot(x))  # as `rounding`
         if self.admissible.priced:
             values += self.charge[rows]
         if later_data is not None:
             values += later_data.table(self.patterns)[rows]
         if self.admissible.sized:
-            values += self._lift(x, rows.stop)
+            values += self.lift(x[None], rows)[:, 0]
         if any(past.frozen):
             values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
         return values
@@ -101,10 +101,34 @@ class Ranking:
         """The same with the limits priced in."""
         return self.bounds(self.condensed.plain.optimum(cost.target), cost.least, past, later_data)
 
-    def _lift(self, x: Array, end: int) -> Array:
-        """How much more a pattern costs at least because its optimum has moves below their least size."""
-        short = np.maximum(self._sizes[:end] - np.abs(self._optima[:end].dot(x)), 0.0)
-        lift: Array = (short * short * self._stiffness[:end]).max(axis=1, initial=0.0)
+    def scaled(self, cost: LeastSquares) -> Array:
+        """x of a cost, shape (n_moves,)."""
+        x: Array = self.condensed.plain.optimum(cost.target) * self.condensed.lengths
+        return x
+
+    def products(self, x: Array) -> Array:
+        """What the table is multiplied by, shape (J, n_moves (n_moves + 1) / 2), for x of shape (J, n_moves)."""
+        products: Array = x.take(self._rows, axis=1) * x.take(self._columns, axis=1)
+        return products
+
+    def rounding(self, x: Array) -> Array:
+        """All that rounding can add to these products, shape (J,): no entry of the table is larger than 1."""
+        added: Array = x.shape[1] * ROUNDING * np.einsum("ji,ji->j", x, x)
+        return added
+
+    def charges(self, rows: Indices, later_data: LaterData | None) -> Array:
+        """What patterns cost beside, shape (rows,)."""
+        return (
+            self.charge[rows] if later_data is None else (self.charge + later_data.table(self.patterns))[rows]
+        )
+
+    def lift(self, x: Array, rows: slice | Indices) -> Array:
+        """How much more patterns cost at least because their optima have moves below their least size.
+
+        For x of shape (J, n_moves) and some rows of the table, shape (rows, J).
+        """
+        short = np.maximum(self._sizes[rows][:, :, None] - np.abs(self._optima[rows] @ x.T), 0.0)
+        lift: Array = (short * short * self._stiffness[rows][:, :, None]).max(axis=1, initial=0.0)
         return lift
 
     def optimum(self, index: int, sample: Sample) -> Optimum:

@@ -100,6 +100,7 @@ class SampleRelaxation:
         v, n_simple, none = of.moves.start, of.n_simple, np.zeros(len(optimum))
         self._lower = np.concatenate((sample.lower[:v], none, sample.lower[n_simple:]))
         self._upper = np.concatenate((sample.upper[:v], none, sample.upper[n_simple:]))
+        self._distances = of.program.distances(optimum, self._lower, self._upper)
         self._active: Array | None = None
         self._signs = np.where(optimum < 0, -1.0, 1.0)
 
@@ -148,7 +149,7 @@ class SampleRelaxation:
         """What multipliers of rows and pulls at the moves add to the target and to the least cost without limits."""
         multipliers = rows.copy()
         multipliers[self._of.moves] = pulls
-        return self._of.program.relaxed(self._optimum, self._lower, self._upper, multipliers)
+        return self._of.program.relaxed(self._distances, multipliers)
 
     def of_bounds(self, multipliers: Array | None) -> Multipliers | None:
         """Multipliers of the problem's bounds, shape (n_bounds,), as those of a relaxation."""

@@ -4,10 +4,11 @@ Every admissible pattern has a lower bound that needs no solver: its optimum wit
 taken best bound first; where the optimum keeps every limit, it is the pattern's own and the search is over;
 otherwise a quadratic program on the pattern gives its best moves and, as a by-product, multipliers of the
 limits. Any multipliers turn the limits into a change of the linear term (Lagrangian relaxation), so that all
-patterns can be ranked again with limits priced in; so do those of programs in which more moves are free, plain
-MPC first. The search ends when no bound beats the best plan.
+patterns can be ranked again with limits priced in, first by those of plain MPC. The search ends when no bound beats
+the best plan.
 
-Few patterns are listed in a table (`ranking`); more are searched as a tree (`tree`) by the same bounds.
+Few patterns are listed in a table (`ranking`, `open_patterns`); more are searched as a tree (`tree`) by the same
+bounds.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from time import perf_counter
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray, as_number
+from mampc.base.checks import Array, as_number
 from mampc.base.tolerances import INSIDE, TIE, tie
 from mampc.base.words import Remark, Status
+from mampc.methods.exact.open_patterns import OpenPatterns
 from mampc.methods.exact.ranking import Ranking, ranking_of
 from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.tree import PatternTree
@@ -73,7 +75,8 @@ class ExactSearch:
         self._solver = PatternSolver(condensed, self.admissible)
         if self._ranking is None:
             self._tree = PatternTree(condensed, self.admissible, self._solver, settings.time_limit)
-        else:
+        self._relaxation: Relaxation | None = None
+        if self._ranking is not None and condensed.bounds.every_move:
             self._relaxation = Relaxation(condensed, np.arange(condensed.n_moves), condensed.U)
 
     def plan(self, sample: Sample, inputs: Array, guess: Array | None = None) -> Plan:
@@ -106,35 +109,35 @@ class ExactSearch:
         return np.inf if limit is None else perf_counter() + 0.95 * limit
 
     def _search_ranking(self, ranking: Ranking, bounds: Array, sample: Sample, past: Allowance) -> Plan:
-        """Patterns of the table best bound first, ranked again whenever the limits are priced anew."""
-        best, deadline, patterns = Incumbent(), self._deadline(), ranking.patterns[ranking.rows(past)]
-        oracle = SampleOracle(self, sample, best)
-
-        def rank_again(limits: LeastSquares | None) -> None:
-            if limits is not None:
-                np.maximum(bounds, ranking.priced(limits, past, sample.later_data), out=bounds)
-
-        rank_again(oracle.of_plain())
-        solved = None
+        """Patterns of the table best bound first, bounded anew whenever a program shows other multipliers."""
+        best, deadline, condensed = Incumbent(), self._deadline(), self.condensed
+        rounding, first = condensed.rounding(sample), None
+        if sample.margins.min(initial=np.inf) < 0:
+            plain = condensed.plain.solve(sample.moves, sample.lower, sample.upper)
+            first = _priced(condensed, sample, plain.multipliers)
+        open_ = OpenPatterns(ranking, sample, past, bounds, first)
+        relaxation = None if self._relaxation is None else self._relaxation.at(sample, sample.moves)
         while True:
-            index = int(bounds.argmin())
-            bound = float(bounds[index])
-            if bound >= oracle.cutoff or bound == np.inf:
+            at, bound = open_.best()
+            if bound == np.inf or bound >= best.objective - tie(best.objective, rounding):
                 return self._plan(sample, best, best.objective)
             if perf_counter() > deadline:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
-            if solved is not None and solved.multipliers is not None and solved.multipliers.any():
-                rank_again(oracle.priced(solved.multipliers))
-                # Where this pattern does not move, its multipliers say little: price the best ones left together.
-                few = bounds.argpartition(min(TOGETHER, len(bounds) - 1))[:TOGETHER]
-                rank_again(oracle.relaxed(np.asarray(patterns[few].any(axis=0))))
-                solved = None
-                continue
-            solved = self._solver.solve(sample, patterns[index], best.objective, deadline)
+            solved = self._solver.solve(sample, ranking.patterns[open_.rows[at]], best.objective, deadline)
             best.offer(solved)
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
-            bounds[index] = np.inf
+            open_.close(at)
+            limits, cutoff = _priced(condensed, sample, solved.multipliers), best.objective
+            if limits is not None:
+                cutoff -= tie(cutoff, rounding)
+                open_.price(limits, cutoff)
+                # What limits moves that this pattern does not make shows with those of the best ones left together.
+                if relaxation is not None and len(few := open_.first(TOGETHER)):
+                    made = np.asarray(ranking.patterns[few].any(axis=0))
+                    together = _priced(condensed, sample, relaxation.with_moves(sample, made))
+                    if together is not None:
+                        open_.price(together, cutoff)
 
     def _search_tree(self, sample: Sample, past: Allowance) -> Plan:
         best = Incumbent()
@@ -159,31 +162,8 @@ class ExactSearch:
         return Plan(best.moves, status, best.solved, lower, None, None, best.objective)
 
 
-class SampleOracle:
-    """One sample as the table sees it: limits are priced on demand."""
-
-    def __init__(self, search: ExactSearch, sample: Sample, best: Incumbent) -> None:
-        self._condensed, self._relaxation = search.condensed, search._relaxation.at(sample, sample.moves)
-        self._sample, self._best = sample, best
-        self._rounding = search.condensed.rounding(sample)
-
-    @property
-    def cutoff(self) -> float:
-        """What a plan has to cost less than to be better than the best so far."""
-        return self._best.objective - tie(self._best.objective, self._rounding)
-
-    def of_plain(self) -> LeastSquares | None:
-        """The limits priced in that plain MPC runs into, if any."""
-        if not self._sample.margins.min(initial=np.inf) < 0:
-            return None
-        sample = self._sample
-        return self.priced(self._condensed.plain.solve(sample.moves, sample.lower, sample.upper).multipliers)
-
-    def relaxed(self, free: BoolArray) -> LeastSquares | None:
-        return self.priced(self._relaxation.with_moves(self._sample, free))
-
-    def priced(self, multipliers: Array | None) -> LeastSquares | None:
-        """The cost with limits priced in by multipliers, if any is not zero."""
-        if multipliers is None or not multipliers.any():
-            return None
-        return self._condensed.priced(self._sample, multipliers)
+def _priced(condensed: CondensedQP, sample: Sample, multipliers: Array | None) -> LeastSquares | None:
+    """The cost with limits priced in by multipliers, if any is not zero."""
+    if multipliers is None or not multipliers.any():
+        return None
+    return condensed.priced(sample, multipliers)
