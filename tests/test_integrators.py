@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+import mampc
 from mampc import IOData, StateSpace, n4sid, prbs
+from mampc.study.own import draft
+from mampc.systems.properties import properties
 
 
 def plant_with(poles, seed=0):
@@ -64,3 +67,27 @@ def test_the_model_rests_where_the_plant_rests(poles):
             np.testing.assert_allclose(y[0], plant.y_op + plant.dc_gain() @ (at_rest - plant.u_op), atol=0.05)
     unseen = record_of(plant, 5, noise=0.0, off=0.0)
     assert (n4sid(record_of(plant, 0), feedthrough=False).validate(unseen).fit > 95).all()
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-4, 1e5)])
+@pytest.mark.parametrize("poles", [(1.0, 0.9), (0.95, 1.0, 0.8)])
+def test_no_level_leaks_into_outputs_that_settle(poles, units):
+    for seed in range(3):
+        model = n4sid(record_of(plant_with(poles, seed), seed, units=units), feedthrough=False).model
+        settles = np.array(poles) < 1
+        assert (model.C[settles, 0] == 0).all()
+        assert (model.C[~settles, 0] != 0).all()
+        np.testing.assert_array_equal(properties(model).integrating.all(axis=1), ~settles)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_loop_on_the_model_of_a_level_beside_a_settling_output_leaves_no_offset(seed):
+    """A leak of the integrator into the other output once let the load drive it away."""
+    plant = plant_with((1.0, 0.9), seed)
+    model = n4sid(record_of(plant, seed), feedthrough=False).model
+    plan = draft(model, properties(model))
+    regulator = mampc.Regulator(mampc.MPC(plan.problem))
+    load = mampc.loads.Steps(sizes=[[0.2, 0.2]], times=[150 * plant.dt])
+    run = mampc.simulate(plant, regulator, plant.y_op, steps=500, loads=[load])
+    asked = np.abs(plan.changes).max(axis=0)
+    assert (np.abs(run.y - plant.y_op)[-20:].mean(axis=0) < 0.01 * asked).all()

@@ -1,5 +1,7 @@
 """Bad measurements: what is believed, what is not, and how the loop goes on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -300,3 +302,14 @@ def test_a_sensor_is_found_stuck_once_and_its_stuck_run_is_no_healthy_one():
     assert np.flatnonzero(found) == [23]
     np.testing.assert_array_equal(state.longest, 0.0)
     np.testing.assert_array_equal(state.stuck, 0.0)
+
+
+def test_noise_as_found_in_the_record_is_no_jump():
+    """Inputs of a small range, and noise as large as what they do."""
+    plant = mampc.StateSpace.from_first_order(gain=5e4, time_constant=4 * 3600, dt=600.0, u_op=0.3, y_op=2e5)
+    limits = mampc.Limits(u_min=0.25, u_max=0.35)
+    for noise, doubted in ((mampc.Noise([200.0], [0.0]), False), (None, True)):
+        model = replace(plant, noise=noise)
+        problem = mampc.TrackingProblem(model, prediction_horizon=20, control_horizon=3, limits=limits)
+        run = mampc.simulate(plant, mampc.Regulator(mampc.MPC(problem)), [2e5], steps=300, noise=200.0)
+        assert any(decision.ignored_outputs for decision in run.decisions) == doubted

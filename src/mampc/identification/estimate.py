@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 from mampc.identification.delays import Integers
@@ -18,6 +20,7 @@ from mampc.identification.simulation_error import (
     fit_inputs,
     fit_trends,
     independent_samples,
+    integrated,
     residuals,
 )
 from mampc.identification.subspace import (
@@ -144,7 +147,33 @@ def _with_integrators(
         A1, stabilised = inside_unit_circle(A1, unstable, q)
         fit = fitted(A1, C1, q)
         if explains_as_well(fit.error, free.error, independent_samples(residuals(A1, C1, fit, records))):
-            return found._replace(A=A1, C=C1, integrators=q, stabilised=stabilised, fit=fit)
+            part = found._replace(A=A1, C=C1, integrators=q, stabilised=stabilised, fit=fit)
+            return _without_leaks(part, records, fitted)
+    return found
+
+
+def _without_leaks(found: Part, records: Scaled, fitted: Callable[..., InputFit]) -> Part:
+    """Integrators act on no output in which records do not show them: a leak, however small, would pass for a level.
+
+    Outputs are let off in the order of how little of an integrator they show, as long as each explains its own as well.
+    """
+    q = found.integrators
+    left = residuals(found.A, found.C, found.fit, records)
+    shown = integrated(found.A, found.C, found.fit, records, q)
+    noise = np.sqrt(sum(np.sum(one**2, axis=0) for one in left))
+    share = np.sqrt(sum(np.sum(one**2, axis=0) for one in shown)) / np.maximum(noise, 1e-300)
+    for i in np.argsort(share).tolist():
+        C = found.C.copy()
+        C[i, :q] = 0.0
+        if share[i] > 1 or np.linalg.matrix_rank(C[:, :q]) < q:
+            break
+        fit = fitted(found.A, C, q)
+        own = residuals(found.A, C, fit, records)
+        error = float(np.sqrt(sum(np.sum(one[:, i] ** 2) for one in own)))
+        independent = independent_samples([one[:, i : i + 1] for one in own])
+        if not explains_as_well(error, float(noise[i]), independent):
+            break
+        found = found._replace(C=C, fit=fit)
     return found
 
 

@@ -170,6 +170,18 @@ def residuals(A: Array, C: Array, fit: InputFit, records: Scaled) -> list[Array]
     return left
 
 
+def integrated(A: Array, C: Array, fit: InputFit, records: Scaled, integrators: int) -> list[Array]:
+    """What the first states, which integrate, add to the outputs of each record, shape (N, l), but for a constant."""
+    q = integrators
+    shown: list[Array] = []
+    for u, trend in zip(records.u, fit.trends, strict=True):
+        push = u @ fit.B[:q].T
+        push[:, : len(trend.drive)] += trend.drive
+        walked = np.cumsum(push, axis=0) @ C[:, :q].T
+        shown.append(walked - walked.mean(axis=0))
+    return shown
+
+
 def states(A: Array, push: Array, x0: Array) -> Array:
     """x[k + 1] = A x[k] + push[k] from x[0] = x0, shape (N, n), without a loop over samples."""
     from scipy.linalg import rsf2csf, schur

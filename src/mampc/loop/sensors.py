@@ -37,6 +37,7 @@ class Thresholds:
 
     Attributes:
         jump_of_reach: default largest jump, as a share of the reach: what the inputs' whole range does to an output.
+        jump_of_noise: default largest jump at least, in standard deviations of the noise kept with the model.
         reach_within: samples within which the inputs reach an output that washes out before its steady state.
         absurd_of_reach: times the reach from the operating point no plant gets; nothing there is ever believed.
         stuck_movement: predicted movement, as a share of the largest jump, that a working sensor shows.
@@ -50,6 +51,7 @@ class Thresholds:
     """
 
     jump_of_reach: float = 0.1
+    jump_of_noise: float = 6.0
     reach_within: int = 10
     absurd_of_reach: float = 100.0
     stuck_movement: float = 0.2
@@ -73,7 +75,8 @@ class SensorChecks:
         y_low, y_high: what the sensors can show, in output units, a scalar or (l,); None for no range.
         largest_jump: distance from its prediction at which a measurement is believed at once, in output
             units, a scalar or (l,). Default: a tenth of what the inputs' whole range does to that output,
-            where that range is finite; infinite (no test for jumps and stuck sensors) elsewhere.
+            where that range is finite, and six times the noise kept with the model at least; infinite (no test for
+            jumps and stuck sensors) elsewhere.
         confirm: >= 1, samples after which a jump that stays is believed.
         stuck_after: >= 2, equal samples after which a sensor may be stuck; None for never.
 
@@ -153,6 +156,8 @@ class Sensors:
         self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
         reach = _reach(problem)
         self._jump = THRESHOLDS.jump_of_reach * reach
+        if problem.model.noise is not None:
+            self._jump = np.maximum(self._jump, THRESHOLDS.jump_of_noise * problem.model.noise.output)
         if checks.largest_jump is not None:
             self._jump = _largest_jump(checks.largest_jump, l)
         self._absurd, self._y_op = THRESHOLDS.absurd_of_reach * reach, problem.model.y_op

@@ -24,6 +24,7 @@ RISEN = 1 - np.exp(-1.0)  # of the way, after one time constant
 LONGEST = 2**13  # samples of a response
 NEGLIGIBLE = 1e-9  # of the largest in its row and column: a channel of rounding alone
 MOST_FOR_ZEROS = 200  # states
+MATTERS = 0.1  # of the largest effect on an output: what an input may do to it unnoticed
 SINGULAR = 1e-6  # of the gain about it: the gain at a zero
 
 
@@ -228,12 +229,15 @@ def gain_deviation(model: StateSpace, found: Properties) -> Array | None:
 
 
 def doubtful_gains(model: StateSpace, found: Properties) -> list[str]:
-    """Channels whose gain is less than two standard deviations, named."""
+    """Channels whose gain is less than two standard deviations, named, where that is no small part of all effects."""
     deviation = gain_deviation(model, found)
-    if deviation is None:
+    if deviation is None or model.evidence is None:
         return []
     inputs = (*model.names.inputs, *model.names.disturbances)
-    weak = (np.abs(found.gain) < 2 * deviation) & (found.gain != 0)
+    moved = np.diff(model.evidence.inputs)[:, 0]
+    effect = np.where(np.isfinite(found.gain), np.abs(found.gain), 0.0) * moved
+    matters = 2 * deviation * moved > MATTERS * effect.max(axis=1, keepdims=True)
+    weak = (np.abs(found.gain) < 2 * deviation) & (found.gain != 0) & matters
     return [f"{model.names.outputs[i]} from {inputs[j]}" for i, j in np.argwhere(weak)]
 
 
