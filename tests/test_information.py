@@ -205,3 +205,36 @@ def test_plans_wait_where_data_are_worth_more_than_a_sample_is():
         )
         first[counts] = int(np.flatnonzero(decision.moves.any(axis=1)).min(initial=3))
     assert first[True] > first[False]
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.0, 5.0])
+def test_prices_that_follow_the_noise_are_those_of_a_bank_that_was_told_it(factor):
+    problem, weights = (
+        problem_of(tank_model(), output_weight=1.0),
+        np.full(len(HYPOTHESES), 1 / len(HYPOTHESES)),
+    )
+    rules = mampc.MoveRules(price=0.4)
+    told = mampc.Regulator(
+        mampc.MAMPC(problem, rules), mampc.LoadBank(problem.model, noise=0.3), value_of_information=True,
+        price_follows_noise=True,
+    )._planner  # fmt: skip
+    scaled = counting(problem, 0.4 * factor, noise=0.3 * np.sqrt(factor))[1]
+    x = np.zeros(told.problem.model.n_states)
+    for change in ([0.5, -0.3], [1.5, 2.0], [0.1, 0.1]):
+        reference = problem.model.y_op + np.array(change)
+        one = told.step(told.initial_state(), x, reference, hypotheses=factor * weights)
+        other = scaled.step(scaled.initial_state(), x, reference, hypotheses=weights)
+        np.testing.assert_allclose(one.plan, other.plan, atol=1e-9)
+        assert one.objective == pytest.approx(other.objective, rel=1e-9)
+        assert one.gap == 0
+
+
+def test_prices_follow_the_noise_only_where_all_patterns_are_listed():
+    problem = problem_of(tank_model())
+    bank = mampc.LoadBank(problem.model, noise=0.1)
+    sparse = mampc.MAMPC(problem, mampc.MoveRules(price=1.0))
+    with pytest.raises(mampc.MampcError, match="value_of_information=True beside it"):
+        mampc.Regulator(sparse, bank, price_follows_noise=True)
+    greedy = mampc.MAMPC(problem, mampc.MoveRules(price=1.0), method="greedy")
+    with pytest.raises(mampc.MampcError, match="price_follows_noise: expected method='exact'"):
+        mampc.Regulator(greedy, bank, value_of_information=True, price_follows_noise=True)

@@ -1,8 +1,7 @@
 """Closed loops to tune on: stand-ins for the plant, references, noise and loads, all drawn from a model by seeds.
 
-Sizes come from the model and its limits alone, so that units decide nothing: references from what a share of the
-inputs' range does, noise from `model.noise` or a share of what the whole range does, loads from what shows in the
-outputs like their noise.
+Sizes come from the model and its limits alone, so that units decide nothing: noise from `model.noise` or a share of
+what the whole range does, references from the noise, loads from what shows in the outputs like their noise.
 """
 
 from __future__ import annotations
@@ -31,8 +30,9 @@ HORIZONS = (10, 60)  # fewest and most samples of a prediction horizon
 FREE_MOVES = 5  # control horizon of plain MPC
 CONDITION = 500.0  # of the program that the move weight of plain MPC aims at, as in dynamic matrix control
 
+LEAST_GAIN = 1e-3  # of the largest: directions that answer less are not asked for
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
-MOVED = 0.02  # share of the inputs' range that set-points ask for, either way
+CHANGE = 10.0  # times the noise: how far set-points go, either way
 CHANGES = 4  # set-point changes of a scenario
 LENGTHS = (160, 300)  # fewest and most samples of a scenario
 HORIZONS_LONG = 5  # a scenario lasts that many prediction horizons, within these
@@ -50,13 +50,16 @@ class Surroundings:
 
     Attributes:
         noise: standard deviations of the measurement noise, shape (l,).
-        reference_changes: set-points differ from the operating point by up to these, shape (l,); None where they
-            are what a share of the inputs' range does.
+        guessed: whether nobody told the noise, nor a record.
+        reference_changes: set-points differ from the operating point by up to these, shape (l,).
+        reach: whether set-points are only those that the inputs can hold.
         loads: kinds of scenarios, each a tuple of loads; scenarios take them in turn.
     """
 
     noise: Array
-    reference_changes: Array | None
+    guessed: bool
+    reference_changes: Array
+    reach: bool
     loads: tuple[tuple[Load, ...], ...]
 
     @classmethod
@@ -70,6 +73,7 @@ class Surroundings:
         l = model.n_outputs
         if noise is None and model.noise is not None and (model.noise.output > 0).all():
             noise = model.noise.output
+        guessed = noise is None
         if noise is None:
             noise = NOISE_OF_REACH * np.abs(response_within_reach(model)) @ _range(problem, "noise")
             if not (noise > 0).all():
@@ -79,15 +83,13 @@ class Surroundings:
         sizes = as_vector("noise", noise, l)
         if (sizes <= 0).any():
             raise MampcError(f"noise: expected positive standard deviations, received {sizes}")
-        changes = None
+        changes = CHANGE * sizes
         if reference_changes is not None:
             changes = as_vector("reference_changes", reference_changes, l)
             if (changes < 0).any():
                 raise MampcError(f"reference_changes: expected numbers of at least 0, received {changes}")
-        else:
-            _range(problem, "reference_changes")
         kinds = every_kind(model, sizes, scenario_length(problem)) if loads is None else _given(loads)
-        return cls(sizes, changes, kinds)
+        return cls(sizes, guessed, changes, reference_changes is None, kinds)
 
 
 def _given(loads: Any) -> tuple[tuple[Load, ...], ...]:
@@ -261,21 +263,18 @@ def _reference(problem: TrackingProblem, around: Surroundings, start: Array, T: 
     gain = static_response(model)
     rest = model.y_op + model.C @ model.steady_state(start) + model.D[:, : len(start)] @ (start - model.u_op)
     rows, period = np.tile(rest, (T, 1)), T / CHANGES
-    for change in range(CHANGES):
-        at = int((change + 0.5 * rng.random()) * period)
-        if around.reference_changes is None:
-            wanted = start + MOVED * _range(problem, "reference_changes") * rng.uniform(-1, 1, len(start))
-            level = rest + gain @ (np.clip(wanted, limits.u_min, limits.u_max) - start)
-        else:
-            level = rest + around.reference_changes * rng.uniform(-1, 1, len(rest))
+    unit = np.where(around.noise > 0, around.noise, 1.0)
+    needed = (
+        np.linalg.pinv(gain / unit[:, None], rcond=LEAST_GAIN) / unit
+    )  # of the inputs, per change of the outputs
+    for number in range(CHANGES):
+        at = int((number + 0.5 * rng.random()) * period)
+        change = around.reference_changes * rng.uniform(-1, 1, len(rest))
+        if around.reach:
+            change = gain @ (np.clip(start + needed @ change, limits.u_min, limits.u_max) - start)
+        level = rest + change
         rows[at:] = np.clip(level, limits.y_min, limits.y_max)
     return rows
-
-
-def reachable(problem: TrackingProblem) -> Array:
-    """A set-point change, shape (l,), that all inputs make together by the share of their range that is assumed."""
-    change: Array = static_response(problem.model) @ (MOVED * _range(problem, "limits"))
-    return change
 
 
 def _range(problem: TrackingProblem, name: str) -> Array:

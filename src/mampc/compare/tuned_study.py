@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import LARGEST, Array
-from mampc.compare.scenarios import CHANGES, STAND_IN, reachable, scenario_length
+from mampc.compare.scenarios import CHANGE, CHANGES, STAND_IN, scenario_length
 from mampc.compare.sweep import BASELINE
 from mampc.compare.tuning import Tuned
 from mampc.loop.loads import Load
@@ -55,7 +55,7 @@ def study_of_model(model: StateSpace, tuned: Tuned, name: str) -> Study:
     """A study of a model alone, which stands in for its plant off by some shares, under each kind of load."""
     problem = tuned.baseline.controller.problem
     samples = scenario_length(problem)
-    size = reachable(problem)
+    size = CHANGE * tuned.noise
     rest = np.clip(model.u_op, problem.limits.u_min, problem.limits.u_max)
     plant = PlantTable(kind="model", operating_inputs=None if (rest == model.u_op).all() else rest.tolist())
     changes = [
@@ -82,7 +82,10 @@ def with_tuning(study: Study, tuned: Tuned) -> Study:
     if tuned.is_plain:
         return study.model_copy(update=changed | {"controllers": [BASELINE]})
     estimator = EstimatorTable(
-        kind="load_bank", value_of_information=True, measurement_noise=tuned.noise.tolist()
+        kind="load_bank",
+        value_of_information=True,
+        price_follows_noise=tuned.noise_guessed,
+        measurement_noise=tuned.noise.tolist(),
     )
     controllers = [
         ControllerTable(name="tuned", method="exact", rules=RulesTable(price=tuned.rules.price)),

@@ -51,16 +51,20 @@ class Candidate:
         name: in tables.
         problem: what it solves.
         estimator: with the noise that it expects.
+        guessed: whether nobody told this noise, so that the price follows what is found of it.
     """
 
     name: str
     problem: TrackingProblem
     estimator: LoadBank
+    guessed: bool = False
 
     def regulator(self, price: float) -> Regulator:
         """It, with a price."""
         controller = MAMPC(self.problem, MoveRules(price=price))
-        return Regulator(controller, self.estimator, value_of_information=True)
+        return Regulator(
+            controller, self.estimator, value_of_information=True, price_follows_noise=self.guessed
+        )
 
     def points(self, prices: Sequence[float], scenarios: Scenarios) -> list[Point]:
         """Its moves and errors in every scenario, price by price."""
@@ -178,6 +182,7 @@ class Tuned:
         reached: whether what was asked for is kept by fewer moves than those of plain MPC.
         baseline: plain MPC, which errors are compared with.
         noise: of the outputs, shape (l,), as assumed or told.
+        noise_guessed: whether nobody told it; then the controller's price follows what its estimator finds of it.
         estimator: of the controller.
         loads: of the scenarios, which took them in turn.
         rows: every run of the second round, as a sweep writes them.
@@ -190,6 +195,7 @@ class Tuned:
     reached: bool
     baseline: Regulator = field(repr=False)
     noise: Array = field(repr=False)
+    noise_guessed: bool = field(repr=False)
     estimator: Estimator = field(repr=False)
     loads: tuple[Any, ...] = field(repr=False)
     rows: list[dict[str, Any]] = field(repr=False)
@@ -202,7 +208,7 @@ class Tuned:
     def at_price(self, price: float) -> Regulator:
         """The same with another price; 0 for none."""
         if isinstance(self.estimator, LoadBank) and not self.is_plain:
-            return Candidate("", self.problem, self.estimator).regulator(price)
+            return Candidate("", self.problem, self.estimator, self.noise_guessed).regulator(price)
         return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.estimator)
 
     @property
@@ -244,7 +250,7 @@ def tune(
         noise: standard deviation of the measurement noise, scalar or (l,); default `model.noise`, else a 500th of
             what the inputs' whole range does to an output.
         reference_changes: set-points differ from the operating point by up to these, scalar or (l,), output units;
-            default what 2 % of the inputs' range does.
+            default ten times the noise, as far as the inputs reach.
         loads: of `mampc.loads`, all in every scenario, or lists of them, which scenarios take in turn; () for none.
             Default steps, a random walk, coloured noise and none in turn, sized by noise and gain.
         baseline: a regulator with plain MPC to compare with, whose horizons, weights and limits hold; default from
@@ -262,7 +268,7 @@ def tune(
     plain = _plain(model, limits, output_weight, baseline)
     problem = plain.controller.problem
     around = Surroundings.of(problem, noise, reference_changes, loads)
-    found = candidates(problem, around.noise)
+    found = candidates(problem, around.noise, around.guessed)
     total = len(found) + FINALISTS + 3
     bar = iter(watched(total, progress))
     done = iter(range(1, total + 1))
@@ -308,7 +314,8 @@ def tune(
         front = _front(own, base, second.hours)
     return Tuned(
         problem if chosen is None else chosen.problem, MoveRules(price=price), expected, front, reached, plain,
-        around.noise, plain.estimator if chosen is None else chosen.estimator, around.loads, rows,
+        around.noise, chosen is not None and chosen.guessed, plain.estimator if chosen is None else chosen.estimator,
+        around.loads, rows,
     )  # fmt: skip
 
 
@@ -343,8 +350,8 @@ def _plain(
     return baseline
 
 
-def candidates(problem: TrackingProblem, noise: Array) -> list[Candidate]:
-    """All that are compared, for a problem of plain MPC."""
+def candidates(problem: TrackingProblem, noise: Array, guessed: bool = False) -> list[Candidate]:
+    """All that are compared, for a problem of plain MPC and noise (l,) that was told or guessed."""
     m, n_p = problem.model.n_inputs, problem.prediction_horizon
     n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
     estimator, found = LoadBank(problem.model, noise=noise), []
@@ -353,12 +360,16 @@ def candidates(problem: TrackingProblem, noise: Array) -> list[Candidate]:
             sparse = replace(
                 problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail * n_p
             )
-            candidate = Candidate(f"move weight x {share:g}, tail {tail * n_p:g}", sparse, estimator)
-            try:
-                candidate.regulator(1.0)
-            except MampcError:  # such as a tail that an unstable model does not have
-                continue
-            found.append(candidate)
+            candidate = Candidate(f"move weight x {share:g}, tail {tail * n_p:g}", sparse, estimator, guessed)
+            for one in (candidate, replace(candidate, guessed=False)):
+                try:
+                    one.regulator(1.0)
+                except (
+                    MampcError
+                ):  # such as a tail that an unstable model does not have, or too many patterns
+                    continue
+                found.append(one)
+                break
     if not found:
         raise MampcError("tune: expected a model that a sparse controller can be built for")
     return found

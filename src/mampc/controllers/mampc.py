@@ -13,6 +13,7 @@ from mampc.base.tolerances import ROUNDING, SAME, URGENT
 from mampc.base.words import Remark, Status
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
+from mampc.methods.exact.search import ExactSearch
 from mampc.methods.method import Method, Plan
 from mampc.methods.registry import method_of
 from mampc.moves.admissible import AdmissiblePatterns
@@ -90,10 +91,21 @@ class MAMPC(Controller):
             if (size > most).any():
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
-    def with_information(self, shifts: Array) -> MAMPC:
-        """This controller with plans that count on later data; `shifts` as `Information` takes them."""
+    def with_information(self, shifts: Array, *, price_follows_noise: bool = False) -> MAMPC:
+        """This controller with plans that count on later data; `shifts` as `Information` takes them.
+
+        Raises:
+            MampcError: prices that follow the noise with another search than the exact one by a table.
+        """
+        by_table = isinstance(self._search, ExactSearch) and self._search.has_table
+        if price_follows_noise and not by_table:
+            raise MampcError(
+                "price_follows_noise: expected method='exact' with so few patterns that all are listed, received "
+                f"{self.method!r} with {self.condensed.n_moves} moves"
+            )
         counting = copy(self)
-        counting.information = Information(self.problem, shifts)
+        price_of = self._admissible.charge if price_follows_noise else None
+        counting.information = Information(self.problem, shifts, price_of)
         return counting
 
     def _with_later_data(self, sample: Sample, hypotheses: Array | None) -> Sample:
@@ -103,7 +115,7 @@ class MAMPC(Controller):
 
     def _charge(self, moves: Array, sample: Sample) -> float:
         pattern = np.abs(moves) > SAME * self.condensed.move_prefix
-        return self._admissible.charge(pattern) + sample.forgone(pattern)
+        return self._admissible.charge(pattern) + sample.charge(pattern)
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
         search = self._search

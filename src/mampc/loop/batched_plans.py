@@ -171,7 +171,7 @@ class BatchedExact(BatchedPlans):
         best, clear = np.empty(len(optima), dtype=np.intp), np.empty(len(optima), dtype=bool)
         costs = self._pattern_costs(inputs)
         if self._information is not None and hypotheses is not None:
-            costs = costs + hypotheses @ self._information.table(self._patterns).T
+            costs = costs + self._information.charges(self._patterns, hypotheses)
         block = max(1, BLOCK // len(self._patterns))
         for start in range(0, len(optima), block):
             part = slice(start, start + block)

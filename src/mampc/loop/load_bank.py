@@ -37,7 +37,7 @@ NOISE_TOLD, NOISE_REMEMBERED = (
     10.0,
     100.0,
 )  # samples' worth of what is told of the noise, and of what is seen of it
-NOISE_RANGE = (1e-4, 1e4)  # of the variance, beside what was told
+NOISE_RANGE = (0.01, 100.0)  # of the variance, beside what was told
 UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 

@@ -35,6 +35,8 @@ class Regulator:
             all is believed; from then on they are held until one is. 0 holds at once.
         value_of_information: plan with what later measurements will tell (see docs/how-it-decides.md): needs `MAMPC`
             and an estimator that knows the noise in output units, a `LoadBank`.
+        price_follows_noise: the price is for the noise that the estimator was told, and is scaled by the variance of
+            what it finds; for noise that was guessed. Needs `value_of_information` and an exact search by a table.
         applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
             position feedback are never exact. In input units, a scalar or (m,); default a hundredth of the
             input's range, or 1e-6 where that is not finite.
@@ -53,6 +55,7 @@ class Regulator:
         sensors: SensorChecks | None = None,
         max_blind_steps: int = 0,
         value_of_information: bool = False,
+        price_follows_noise: bool = False,
         applied_tolerance: Any = None,
         reference_filter: ReferenceFilter | None = None,
     ) -> None:
@@ -94,8 +97,11 @@ class Regulator:
         if self.estimator.planning_model is not self.estimator.model:
             self._planner = controller.with_model(self.estimator.planning_model)
         self.value_of_information = as_flag("value_of_information", value_of_information)
+        self.price_follows_noise = as_flag("price_follows_noise", price_follows_noise)
+        if self.price_follows_noise and not self.value_of_information:
+            raise MampcError("price_follows_noise: expected value_of_information=True beside it")
         if self.value_of_information:
-            self._planner = _with_information(self._planner, self.estimator)
+            self._planner = _with_information(self._planner, self.estimator, self.price_follows_noise)
 
     def __repr__(self) -> str:
         return f"Regulator({type(self.controller).__name__}, {self.estimator!r})"
@@ -294,7 +300,7 @@ class Regulator:
         return estimate, judged, sensors
 
 
-def _with_information(planner: Controller, estimator: Estimator) -> Controller:
+def _with_information(planner: Controller, estimator: Estimator, price_follows_noise: bool) -> Controller:
     """The controller with plans that count on later data.
 
     Raises:
@@ -310,7 +316,7 @@ def _with_information(planner: Controller, estimator: Estimator) -> Controller:
             "value_of_information: expected an estimator that knows the noise in output units, such as a LoadBank, "
             f"received {type(estimator).__name__}"
         )
-    return planner.with_information(shifts)
+    return planner.with_information(shifts, price_follows_noise=price_follows_noise)
 
 
 def default_estimator(problem: TrackingProblem) -> Estimator:

@@ -11,12 +11,15 @@ beside a plan with every move free. As innovations are white and the pattern is 
 later moves with later data is, limits aside, the cost of its plan and forgone(S), but for a constant that all patterns
 share. It is a sum of squares and falls with every move that a pattern gains, so that it is a price as any other.
 
-Hypotheses about the loads have a G each; their weights mix what is forgone under each.
+Hypotheses about the loads have a G each; their weights mix what is forgone under each. All of it grows with the
+variance of the noise, and so may the price: then what it costs for the noise told is scaled by the sum of the weights,
+1 where the noise is as told.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -35,9 +38,16 @@ class Information:
         problem: the tracking problem.
         shifts: G of each hypothesis and each of the samples 1 .. nc - 1, of (x, d_u, d_y),
             shape (B, nc - 1, n + m + l, l).
+        price_of: of a pattern for the noise told, where prices follow the noise; None where they do not.
     """
 
-    def __init__(self, problem: TrackingProblem, shifts: Array) -> None:
+    def __init__(
+        self,
+        problem: TrackingProblem,
+        shifts: Array,
+        price_of: Callable[[BoolArray], float] | None = None,
+    ) -> None:
+        self._price_of = price_of
         self._m, self.hypotheses = problem.model.n_inputs, len(shifts)
         self._later: list[tuple[Array, Array]] = []  # U, and T G of all hypotheses side by side
         for j in range(1, problem.control_horizon):
@@ -56,7 +66,7 @@ class Information:
             shifted = np.matmul(of_estimate, shifts[:, j - 1])  # (B, moves, l)
             self._later.append((condensed.U, shifted.swapaxes(0, 1).reshape(len(of_estimate), -1)))
         self._known: dict[tuple[int, bytes], Array] = {}
-        self._tables: dict[int, tuple[BoolArray, Array]] = {}
+        self._tables: dict[int, tuple[BoolArray, Array, Array]] = {}
 
     def forgone(self, pattern: BoolArray) -> Array:
         """Of a pattern, shape (n_moves,), under each hypothesis, shape (B,)."""
@@ -70,13 +80,22 @@ class Information:
             total += known
         return total
 
-    def table(self, patterns: BoolArray) -> Array:
-        """Of many patterns (K, n_moves), which are kept as they are, shape (K, B)."""
+    def price(self, pattern: BoolArray) -> float:
+        """Of a pattern, shape (n_moves,), where prices follow the noise; else 0."""
+        return 0.0 if self._price_of is None else self._price_of(pattern)
+
+    def charges(self, patterns: BoolArray, weights: Array) -> Array:
+        """What patterns (K, n_moves) cost beside their prices with weights (..., B), shape (..., K).
+
+        The array of patterns is taken to stay as it is.
+        """
         known = self._tables.get(id(patterns))
         if known is None:
-            rows = np.array([self.forgone(pattern) for pattern in patterns])
-            known = self._tables[id(patterns)] = patterns, rows
-        return known[1]
+            prices = np.array([self.price(pattern) for pattern in patterns])
+            rows = np.array([self.forgone(pattern) for pattern in patterns]) + prices[:, None]
+            known = self._tables[id(patterns)] = patterns, rows.T, prices
+        charges: Array = weights @ known[1] - known[2]
+        return charges
 
     def at(self, weights: Array) -> InformationNow:
         """With these weights of the hypotheses, shape (B,)."""
@@ -98,11 +117,11 @@ class InformationNow(NamedTuple):
     information: Information
     weights: Array
 
-    def forgone(self, pattern: BoolArray) -> float:
-        """By a pattern, shape (n_moves,)."""
-        return float(self.information.forgone(pattern).dot(self.weights))
+    def charge(self, pattern: BoolArray) -> float:
+        """What a pattern, shape (n_moves,), costs beside its price."""
+        forgone = float(self.information.forgone(pattern).dot(self.weights))
+        return forgone + self.information.price(pattern) * float(self.weights.sum() - 1)
 
-    def table(self, patterns: BoolArray) -> Array:
-        """By patterns (K, n_moves), shape (K,)."""
-        table: Array = self.information.table(patterns).dot(self.weights)
-        return table
+    def charges(self, patterns: BoolArray) -> Array:
+        """The same of patterns (K, n_moves), shape (K,)."""
+        return self.information.charges(patterns, self.weights)

@@ -100,7 +100,7 @@ class PatternSolver:
         restriction = self._restriction(pattern)
         optimum = restriction.optimum(sample.target)
         base = sample.cost + restriction.excess(sample.target)
-        base += self.admissible.charge(pattern) + sample.forgone(pattern)
+        base += self.admissible.charge(pattern) + sample.charge(pattern)
         sizes = self.admissible.min_size[pattern] if self.admissible.sized and pattern.any() else None
         lower, upper = kept = bounds[0][restriction.bounds], bounds[1][restriction.bounds]
         if within is not None:

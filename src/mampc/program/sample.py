@@ -73,11 +73,11 @@ class Optimum:
 
 
 class LaterData(Protocol):
-    """What patterns forgo of what later measurements will tell; see `moves.information`."""
+    """What patterns cost beside their prices, for what later measurements will tell; see `moves.information`."""
 
-    def forgone(self, pattern: BoolArray) -> float: ...
+    def charge(self, pattern: BoolArray) -> float: ...
 
-    def table(self, patterns: BoolArray) -> Array: ...
+    def charges(self, patterns: BoolArray) -> Array: ...
 
 
 class Sample(Optimum):
@@ -133,9 +133,9 @@ class Sample(Optimum):
         """Its entries for the moves, shape (n_moves,)."""
         return self.data[self.parts.f_moves]
 
-    def forgone(self, pattern: BoolArray) -> float:
-        """What a pattern, shape (n_moves,), forgoes of later measurements, 0 where plans do not count on these."""
-        return 0.0 if self.later_data is None else self.later_data.forgone(pattern)
+    def charge(self, pattern: BoolArray) -> float:
+        """What a pattern, shape (n_moves,), costs beside its price, 0 where plans do not count on later data."""
+        return 0.0 if self.later_data is None else self.later_data.charge(pattern)
 
     @property
     def constant(self) -> float:

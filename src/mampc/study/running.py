@@ -148,7 +148,12 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
     smooth = None if table.reference_filter is None else table.reference_filter.made()
     try:
         return Regulator(
-            controller, estimator, reference_filter=smooth, value_of_information=counts, **_sensors(study)
+            controller,
+            estimator,
+            reference_filter=smooth,
+            value_of_information=counts,
+            price_follows_noise=counts and study.estimator.price_follows_noise,
+            **_sensors(study),
         )
     except MampcError as error:
         raise StudyError(f"controllers, {table.name!r}, reference_filter: {error}") from None
@@ -316,7 +321,7 @@ def _estimator(study: Study, problem: TrackingProblem) -> Estimator:
     try:
         if table.kind == "load_bank":
             return LoadBank.for_problem(problem, noise=table.measurement_noise)
-        settings = table.model_dump(exclude={"kind", "value_of_information"})
+        settings = table.model_dump(exclude={"kind", "value_of_information", "price_follows_noise"})
         return KalmanFilter.offset_free(problem.model, **settings)
     except MampcError as error:
         raise StudyError(f"[estimator] {error}") from None

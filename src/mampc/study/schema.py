@@ -341,6 +341,7 @@ class ControllerTable(Table):
 class EstimatorTable(Table):
     kind: Literal["kalman_filter", "load_bank"] = "kalman_filter"
     value_of_information: bool = False
+    price_follows_noise: bool = False
     disturbance: Literal["auto", "output", "input"] = "auto"
     measurement_noise: Values | None = None
     drift: Values | None = None
@@ -356,6 +357,8 @@ class EstimatorTable(Table):
                 )
         elif self.value_of_information:
             raise ValueError('value_of_information with kind = "load_bank" only, which knows the noise')
+        if self.price_follows_noise and not self.value_of_information:
+            raise ValueError("value_of_information beside price_follows_noise")
         return self
 
 

@@ -81,7 +81,7 @@ class Ranking:
             free: the free optimum, shape (n_moves,).
             least: its cost.
             past: what the applied moves leave.
-            later_data: what patterns forgo of them, for plans that count on these.
+            later_data: what patterns cost beside their prices, for plans that count on them.
         """
         x = free * self.condensed.lengths
         rows = self.rows(past)
@@ -90,7 +90,7 @@ class Ranking:
         if self.admissible.priced:
             values += self.charge[rows]
         if later_data is not None:
-            values += later_data.table(self.patterns)[rows]
+            values += later_data.charges(self.patterns)[rows]
         if self.admissible.sized:
             values += self.lift(x[None], rows)[:, 0]
         if any(past.frozen):
@@ -119,7 +119,9 @@ class Ranking:
     def charges(self, rows: Indices, later_data: LaterData | None) -> Array:
         """What patterns cost beside, shape (rows,)."""
         return (
-            self.charge[rows] if later_data is None else (self.charge + later_data.table(self.patterns))[rows]
+            self.charge[rows]
+            if later_data is None
+            else (self.charge + later_data.charges(self.patterns))[rows]
         )
 
     def lift(self, x: Array, rows: slice | Indices) -> Array:

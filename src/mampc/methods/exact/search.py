@@ -79,6 +79,11 @@ class ExactSearch:
         if self._ranking is not None and condensed.bounds.every_move:
             self._relaxation = Relaxation(condensed, np.arange(condensed.n_moves), condensed.U)
 
+    @property
+    def has_table(self) -> bool:
+        """Whether all patterns are listed."""
+        return self._ranking is not None
+
     def plan(self, sample: Sample, inputs: Array, guess: Array | None = None) -> Plan:
         """The best moves of all admissible patterns for one sample."""
         past = self.admissible.allowance(inputs, sample.frozen)
@@ -97,7 +102,7 @@ class ExactSearch:
             optimum = ranking.optimum(at, sample)
             margins = optimum.margins
             if not len(margins) or margins[margins.argmin()] > INSIDE:
-                objective = optimum.cost + float(ranking.charge[at]) + sample.forgone(ranking.patterns[at])
+                objective = optimum.cost + float(ranking.charge[at]) + sample.charge(ranking.patterns[at])
                 if objective - bounds[best] <= TIE * objective:
                     return Plan(
                         optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs, objective,
