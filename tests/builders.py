@@ -88,7 +88,7 @@ def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, outp
     """The cost of planned inputs as `TrackingProblem` states it, by simulating the model."""
     n_p, limits = problem.prediction_horizon, problem.limits
     y = predicted(problem.model, x, plan, n_p + 1, input_disturbance, output_disturbance)
-    error = np.broadcast_to(reference, y.shape) - y
+    error = distance(problem, y, reference)
     changes = np.diff(np.vstack([u_previous, plan]), axis=0)
     weighed = changes if problem.weigh_first_move else changes[1:]
     excess = np.maximum(0.0, np.maximum(y - limits.y_max, limits.y_min - y))[1:]
@@ -99,6 +99,15 @@ def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, outp
         + problem.output_limit_weight * np.sum(scaled + scaled**2 / 2)
         + cost_of_inputs(problem, plan[np.minimum(np.arange(n_p + 1), len(plan) - 1)])
     )
+
+
+def distance(problem, y, reference):
+    """How far outputs (T, l) are from their references or zones, (l,) or (T, l), or a `Zone` of that shape."""
+    if isinstance(reference, mampc.Zone):
+        low, high = reference.low, reference.high
+    else:
+        low, high = reference - problem.zone_below, reference + problem.zone_above
+    return y - np.clip(y, np.broadcast_to(low, y.shape), np.broadcast_to(high, y.shape))
 
 
 def cost_of_inputs(problem, u):

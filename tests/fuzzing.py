@@ -141,6 +141,8 @@ def loops(draw):
         tail_horizon=draw(st.sampled_from([0.0, 0.0, 2.0])),
         output_limit_weight=draw(st.sampled_from([1e2, 1e4])),
         u_target_weight=draw(st.sampled_from([0.0, 0.0, 1e-3, 0.1])), u_cost=draw(input_costs(told, model)),
+        zone_below=scale * draw(st.sampled_from([0.0, 0.0, 0.1, np.inf])),
+        zone_above=scale * draw(st.sampled_from([0.0, 0.0, 0.1, 1.0])),
     )  # fmt: skip
     rules, method, settings = None, draw(st.sampled_from(["mpc", "alternating", "exact", *SPARSE])), {}
     if method != "mpc":

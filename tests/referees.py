@@ -92,7 +92,10 @@ def program_of(problem, x, u_previous, reference):
     theta = np.array(
         [(predicted(model, x, rest + unit.reshape(n_c, m), n_p + 1) - free).ravel() for unit in to_inputs.T]
     ).T
+    zoned = np.tile((problem.zone_below > 0) | (problem.zone_above > 0), n_p + 1)
+    q = np.tile(np.diag(problem.output_weight), n_p + 1)
     Q, R = np.kron(np.eye(n_p + 1), problem.output_weight), np.kron(np.eye(n_c), problem.move_weight)
+    Q[zoned] = 0.0
     error = (np.broadcast_to(reference, free.shape) - free).ravel()
     scale, w = violation_scale(problem), problem.output_limit_weight
     H = np.zeros((l + n, l + n))
@@ -119,7 +122,22 @@ def program_of(problem, x, u_previous, reference):
     ])  # fmt: skip
     limited = np.isfinite(bounds)
     constant = float(error @ Q @ error) + cost_of_inputs(problem, held)
-    return Program(H, f, constant, rows[limited], bounds[limited])
+    rows, bounds = rows[limited], bounds[limited]
+    if zoned.any():  # an error of either sign for each value, between the violations and the moves
+        k = int(zoned.sum())
+        H = np.block([
+            [H[:l, :l], np.zeros((l, k)), H[:l, l:]], [np.zeros((k, l)), np.diag(2 * q[zoned]), np.zeros((k, n))],
+            [H[l:, :l], np.zeros((n, k)), H[l:, l:]],
+        ])  # fmt: skip
+        f = np.concatenate([f[:l], np.zeros(k), f[l:]])
+        rows = np.hstack([rows[:, :l], np.zeros((len(rows), k)), rows[:, l:]])
+        away = error[zoned]  # of the free outputs, from the reference
+        above, below = (np.tile(width, n_p + 1)[zoned] for width in (problem.zone_above, problem.zone_below))
+        for sign, room in ((1.0, away + above), (-1.0, below - away)):
+            finite = np.isfinite(room)
+            wide = np.hstack([np.zeros((k, l)), -sign * np.eye(k), sign * theta[zoned]])
+            rows, bounds = np.vstack([rows, wide[finite]]), np.concatenate([bounds, room[finite]])
+    return Program(H, f, constant, rows, bounds)
 
 
 def best_on(program, pattern, n_violations, at_least=None, at_most=None):
@@ -159,7 +177,8 @@ def best_on(program, pattern, n_violations, at_least=None, at_most=None):
 def best_on_every_pattern(problem, rules, x, u_previous, reference):
     """The least cost, price aside, on every pattern of `all_patterns`, least sizes kept by trying all signs."""
     program = program_of(problem, x, u_previous, reference)
-    n_c, m, v = problem.control_horizon, problem.model.n_inputs, problem.model.n_outputs
+    n_c, m = problem.control_horizon, problem.model.n_inputs
+    v = len(program.f) - n_c * m
     size = np.tile(np.broadcast_to(rules.min_size, m), n_c)
     values = []
     for pattern in all_patterns(n_c, m):
@@ -184,8 +203,9 @@ def scip_bounds(problem, rules, x, u_previous, reference, seconds):
 
     Every move needs finite limits; blocks, least sizes and limits per sample are left to brute force.
     """
-    n_c, m, l = problem.control_horizon, problem.model.n_inputs, problem.model.n_outputs
+    n_c, m = problem.control_horizon, problem.model.n_inputs
     program, n = program_of(problem, x, u_previous, reference), n_c * m
+    l = len(program.f) - n  # violations
     scip = pyscipopt.Model()
     scip.hideOutput()
     for name, value in {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mampc
-from builders import cost_of_inputs, fading, predicted, random_model, violation_scale
+from builders import cost_of_inputs, distance, fading, predicted, random_model, violation_scale
 from mampc import Remark
 from referees import charge
 from seeds import examples
@@ -59,7 +59,7 @@ def random_controller(seed, method):
         tail_horizon=float(rng.choice([0.0, 0.0, 3.0])), weigh_first_move=m > 1 or rng.random() < 0.5,
         output_limit_weight=float(rng.choice([10.0, 1e4])),
     )  # fmt: skip
-    problem = with_input_cost(np.random.default_rng([seed, 1]), problem)
+    problem = with_more(np.random.default_rng([seed, 1]), problem)
     rules = random_rules(rng)
     if method == "mpc":
         return rng, mampc.MPC(problem), mampc.MoveRules()
@@ -72,8 +72,8 @@ def random_controller(seed, method):
     return rng, mampc.MAMPC(problem, rules, method=name, on_limit_violation=urgent, **settings), rules
 
 
-def with_input_cost(rng, problem):
-    """The problem, and as often as not with targets for its inputs or costs where a limit is."""
+def with_more(rng, problem):
+    """The problem, and as often as not with targets for its inputs, costs where a limit is, or zones."""
     limits, m = problem.limits, problem.model.n_inputs
     target = {}
     if rng.random() < 0.3:
@@ -85,6 +85,9 @@ def with_input_cost(rng, problem):
     if rng.random() < 0.3:
         cost = rng.choice([1e-3, 0.1]) * rng.uniform(-1, 1, m)
         cost[(cost > 0) & np.isinf(limits.u_min) | (cost < 0) & np.isinf(limits.u_max)] = 0.0
+    if rng.random() < 0.25 and not problem.tail_horizon and problem.weigh_first_move:
+        target["zone_below"] = rng.choice([0.0, 0.5, np.inf], problem.model.n_outputs)
+        target["zone_above"] = rng.choice([0.0, 0.3], problem.model.n_outputs)
     return replace(problem, u_cost=cost, **target)
 
 
@@ -142,7 +145,7 @@ def cost_of(problem, x, u_previous, reference, plan, limits, input_disturbance, 
     beyond = int(np.ceil(np.log(1e-16) / np.log(gamma))) if L else 0
     y = predicted(problem.model, x, plan, n_p + 1 + beyond, input_disturbance, output_disturbance)
     reference = np.broadcast_to(reference, (n_p + 1, y.shape[1]))
-    error = np.vstack([reference, np.repeat(reference[-1:], beyond, axis=0)]) - y
+    error = distance(problem, y, np.vstack([reference, np.repeat(reference[-1:], beyond, axis=0)]))
     weight = np.concatenate([np.ones(n_p + 1), gamma ** np.arange(1, beyond + 1)])
     changes = np.diff(plan, axis=0, prepend=u_previous[None])
     weighed = changes if problem.weigh_first_move else changes[1:]

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mampc.study import load_study, run_study
+from mampc.study import load_study, parse_study, run_study
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -42,3 +42,16 @@ def test_the_small_valve_returns_to_its_resting_value(found):
     assert runs["MPC"].u[12, 1] > 55.0  # it helps while it is needed
     moves = {name: run.metrics(threshold=0.1).moves.sum() for name, run in runs.items()}
     assert moves["price"] < 0.1 * moves["MPC"]
+
+
+def test_levels_that_may_float_need_fewer_moves():
+    text = (EXAMPLES / "zone.toml").read_text()
+    points = text.replace("zone_below = 0.5\nzone_above = 0.5\n", "")
+    assert points != text
+    moves = []
+    for study in (text, points):
+        runs = run_study(parse_study(study)).runs["with loads"]
+        moves.append([runs[name].metrics(threshold=0.1).moves.sum() for name in ("MPC", "price")])
+    (mpc, price), (mpc_at_points, price_at_points) = moves
+    assert mpc < 0.6 * mpc_at_points
+    assert price < 0.8 * price_at_points

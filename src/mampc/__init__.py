@@ -51,6 +51,7 @@ from mampc.methods import (
 )
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.zone import Zone
 from mampc.systems.linearisation import linearise
 from mampc.systems.mismatch import Mismatch
 from mampc.systems.noise import Noise
@@ -108,6 +109,7 @@ __all__ = [
     "Tuned",
     "Validation",
     "Valves",
+    "Zone",
     "excite",
     "largest_offset",
     "learn_gains",

@@ -135,6 +135,7 @@ def _problem(tuned: Tuned) -> ProblemTable:
         output_limit_weight=problem.output_limit_weight, tail_horizon=problem.tail_horizon,
         u_target=None if problem.u_target is None else problem.u_target.tolist(),
         u_target_weight=_weight(problem.u_target_weight), u_cost=problem.u_cost.tolist(),
+        zone_below=problem.zone_below.tolist(), zone_above=problem.zone_above.tolist(),
     )  # fmt: skip
 
 

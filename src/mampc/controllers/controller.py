@@ -24,6 +24,7 @@ from mampc.program.daqp import active_bounds
 from mampc.program.limits_now import InputRange, LimitsNow, UsualLimits
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.sample import Indices, Sample
+from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
 
 ROUNDED = 1e-12  # relative to an input: what sums of moves may be off by
@@ -133,7 +134,7 @@ class Controller(ABC):
         Args:
             state: from `initial_state` or the previous decision.
             x: the model's (deviation) state, shape (n,).
-            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead.
+            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead; or a `Zone`.
             output_disturbance: added to every predicted output, shape (l,).
             input_disturbance: added to every input of the model, shape (m,).
             measured_disturbance: the model's measured disturbances, taken to stay as they are, in
@@ -156,8 +157,11 @@ class Controller(ABC):
         self._check(state)
         x = as_shaped("x", x, self._x_shape)
         constant, previewed = self._reference_shapes
-        depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
-        reference = as_shaped("reference", reference, constant if depth == 1 else previewed)
+        if isinstance(reference, Zone):
+            reference = self.condensed.parameter.of_zone(reference)
+        else:
+            depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
+            reference = as_shaped("reference", reference, constant if depth == 1 else previewed)
         limits_now = self._usual_limits if limits is None else LimitsNow(limits, self.condensed)
         applied, frozen = state.inputs[-1], None
         in_manual = self.manual_inputs(manual)

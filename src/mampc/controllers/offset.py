@@ -25,8 +25,8 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
 
     It holds for `method="exact"` in steady state, model and disturbances constant, wherever limits leave room to
     remove the offset. It is infinite where nothing is promised: the tail horizon is short against the transient,
-    the model has fewer inputs than outputs (or poles at one), inputs have targets or a cost, or the rules may
-    forbid to move all inputs at once (`max_moves`, `max_moves_per_step`), by less than `min_size`, or at any
+    the model has fewer inputs than outputs (or poles at one), inputs have targets or a cost, outputs a zone, or the
+    rules may forbid to move all inputs at once (`max_moves`, `max_moves_per_step`), by less than `min_size`, or at any
     sample (`blocks`).
     """
     problem = as_instance("problem", problem, TrackingProblem)
@@ -40,7 +40,7 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     unmoved = admissible.allowance(np.zeros((rules.memory, m)))
     promised = admissible.allows(all_at_once, unmoved) and not admissible.sized and rules.blocks is None
     stable = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0) < 1 - 1e-9
-    if not promised or not stable or m < l or problem.prices_inputs:
+    if not promised or not stable or m < l or problem.prices_inputs or problem.zoned.any():
         return nothing
     gain = model.dc_gain()[:, :m]
     if np.linalg.matrix_rank(gain) < l:

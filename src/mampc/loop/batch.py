@@ -308,6 +308,7 @@ class _Loops:
             course = self._filter.course(tracked, asked, regulator._samples)
             tracked, ahead = course[:, 0], course.reshape(len(y), -1)
         place = regulator._planner.condensed.parameter
+        ahead = place.with_ends(ahead.reshape(len(y), -1, y.shape[1])).reshape(len(y), -1)
         parameters = np.ones((len(y), place.one.stop + ahead.shape[1]))
         parameters[:, place.x], parameters[:, place.u_previous] = estimate.x, u
         parameters[:, place.u_deviation] = u

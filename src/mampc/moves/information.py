@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
-from mampc.base.errors import MampcWarning
+from mampc.base.errors import MampcError, MampcWarning
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import Limits, TrackingProblem
 
@@ -47,6 +47,10 @@ class Information:
         shifts: Array,
         price_of: Callable[[BoolArray], float] | None = None,
     ) -> None:
+        if problem.zoned.any():
+            raise MampcError(
+                "problem: expected set points where plans count on later data, received outputs with a zone"
+            )
         self._price_of = price_of
         self._m, self.hypotheses = problem.model.n_inputs, len(shifts)
         self._later: list[tuple[Array, Array]] = []  # U, and T G of all hypotheses side by side
@@ -54,6 +58,7 @@ class Information:
             from_then_on = replace(
                 problem, prediction_horizon=problem.prediction_horizon - j,
                 control_horizon=problem.control_horizon - j, limits=Limits(), weigh_first_move=True,
+                u_cost=0.0,
             )  # fmt: skip
             with warnings.catch_warnings():  # the whole problem has warned of its condition
                 warnings.simplefilter("ignore", MampcWarning)

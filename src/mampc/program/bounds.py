@@ -6,8 +6,10 @@ The bounded quantities, in this order:
     moves             du_j within du_max, or without move limits du_0 within u_min - u_prev ..       (simple)
     inputs            u_j - u_prev within u_min - u_prev .. u_max - u_prev, those not said above
     outputs           theta d - rho_i e <= y_max - y_op - free, then theta d + rho_i e >= y_min - y_op - free
+    zones             low - g <= theta d - s <= high - g, s an error of either sign (see `zone_rows`)
 
-rho falls evenly along the horizon, see `TrackingProblem`; e is scaled as stated there.
+rho falls evenly along the horizon, see `TrackingProblem`; e is scaled as stated there. Errors s are violations as well:
+without bounds, behind the others, and scaled so that each costs its square.
 """
 
 from __future__ import annotations
@@ -15,11 +17,13 @@ from __future__ import annotations
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.program.least_distance import ViolationCost
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
 from mampc.program.qp import UNBOUNDED
 from mampc.program.sample import Indices
+from mampc.program.zone_rows import ZoneRows
 
 FADED = 0.5  # of a violation at the first sample: what it may be at the last at the same penalty
 
@@ -29,7 +33,9 @@ class Bounds:
 
     Attributes:
         every_move: whether every move has a simple bound; if not, the first inputs have.
-        n_violations: how many outputs are limited.
+        n_limited: how many outputs are limited.
+        n_violations: these, and how many errors of zones there are.
+        violation_cost: of all violations.
         n_simple: violations and moves with simple bounds.
         size: how many there are.
         rows: the other bounded quantities per (violations, moves), shape (rows, n_violations + n_moves).
@@ -40,6 +46,8 @@ class Bounds:
         move_of_bound: the move that makes an input row new, -1 for other bounds, shape (n_bounds,).
         above, below: rows of theta that y_max and y_min bound.
         above_rows, below_rows: where they stand among the bounds, slices.
+        zones: the values that have zones, None where there are none.
+        zone_rows: where they stand among the bounds, a slice.
     """
 
     def __init__(
@@ -49,7 +57,14 @@ class Bounds:
         m, l, n = problem.model.n_inputs, problem.model.n_outputs, theta.shape[1]
         self.every_move = every_move or bool(np.isfinite(limits.du_max).any())
         limited = np.isfinite(limits.y_min) | np.isfinite(limits.y_max)
-        self.n_violations = v = int(limited.sum())
+        self.n_limited = v_limited = int(limited.sum())
+        self.zones = ZoneRows(problem, prediction, parameter) if problem.zoned.any() else None
+        n_zones = 0 if self.zones is None else len(self.zones.root)
+        self.n_violations = v = v_limited + n_zones
+        self.violation_cost = ViolationCost(
+            np.repeat([problem.output_limit_weight, 0.0], [v_limited, n_zones]),
+            np.repeat([problem.output_limit_weight, 2.0], [v_limited, n_zones]),
+        )
         n_simple = self.n_simple = v + (n if self.every_move else m)
         inputs = np.flatnonzero(np.tile(np.isfinite(limits.u_min) | np.isfinite(limits.u_max), n_c))
         inputs = inputs[inputs >= (0 if self.every_move else m)]
@@ -64,7 +79,7 @@ class Bounds:
         fading = fade(problem.prediction_horizon)
         self._fading_above, self._fading_below = fading[self.above // l], fading[self.below // l]
         violation = np.zeros((l, v))
-        violation[limited] = np.diag(1 / self.violation_scale[limited])
+        violation[limited, :v_limited] = np.diag(1 / self.violation_scale[limited])
         cumulate = np.kron(np.tri(n_c), np.eye(m))
         self.rows = np.block(
             [
@@ -73,6 +88,9 @@ class Bounds:
                 [violation[self.below % l] * self._fading_below[:, None], theta[self.below]],
             ]
         )
+        if self.zones is not None:
+            per_error = np.hstack([np.zeros((n_zones, v_limited)), np.diag(-1 / self.zones.root)])
+            self.rows = np.vstack([self.rows, np.hstack([per_error, self.zones.theta])])
         self.of_moves = np.vstack([np.eye(n_simple - v, n), self.rows[:, v:]])
         self.input_rows = slice(n_simple, n_simple + len(inputs))
         self.size = n_simple + len(self.rows)
@@ -80,11 +98,16 @@ class Bounds:
         self.move_of_bound[self.input_rows] = inputs
         start, middle = self.input_rows.stop, self.input_rows.stop + len(self.above)
         self.above_rows, self.below_rows = slice(start, middle), slice(middle, middle + len(self.below))
+        self.zone_rows = slice(middle + len(self.below), self.size)
 
         self._theta_above, self._theta_below = theta[self.above], theta[self.below]
         self.lower, self.upper = (parameter.no_map(self.size) for _ in range(2))
         self._bound_inputs(problem, parameter, inputs)
         self._bound_outputs(problem, parameter, prediction.free)
+        if self.zones is not None:
+            errors = slice(v_limited, v)
+            self.lower[errors, parameter.one], self.upper[errors, parameter.one] = -UNBOUNDED, UNBOUNDED
+            self.lower[self.zone_rows], self.upper[self.zone_rows] = self.zones.low, self.zones.high
 
     def _bound_inputs(self, problem: TrackingProblem, parameter: Parameter, inputs: Indices) -> None:
         """Fill in the bounds of violations, moves and inputs."""
@@ -137,6 +160,19 @@ class Bounds:
                 over /= self._fading_below
             excess[below] = np.maximum(excess[below], over.reshape(-1, len(below)).max(axis=0))
         return np.maximum(excess, 0.0)
+
+    def zone_errors(self, moves: Array, lower: Array, upper: Array) -> Array:
+        """How far values are below their zones (negative) or above them, weighted: their squares sum up to the cost.
+
+        Args:
+            moves, lower, upper: see `excess`.
+        """
+        if self.zones is None:
+            return np.zeros(0)
+        values = self.zones.theta.dot(moves)
+        low, high = lower[self.zone_rows], upper[self.zone_rows]
+        errors: Array = self.zones.root * (values - np.minimum(np.maximum(values, low), high))
+        return errors
 
 
 def _least_move_cost(problem: TrackingProblem, prediction: Prediction) -> Array:

@@ -50,7 +50,7 @@ class CondensedQP:
     Attributes:
         n_moves: nc * m; moves are time-major.
         U: upper triangular, shape (n_moves, n_moves).
-        H: 2 U' U, the Hessian in the moves.
+        H: 2 U' U, the Hessian in the moves; where outputs have zones as if these were set points.
         R: weights of the moves, shape (n_moves, n_moves).
         plain: the problem with every move free, which is plain MPC; whoever solves it shares its solver.
         lengths: of U's columns, shape (n_moves,).
@@ -91,11 +91,12 @@ class CondensedQP:
         self.bounds = Bounds(problem, prediction, parameter, every_move=bound_every_move)
         self.n_violations = v = self.bounds.n_violations
 
-        root = np.kron(np.eye(problem.prediction_horizon + 1), square_root(problem.output_weight))
+        single = ~problem.zoned
+        root = np.kron(np.eye(problem.prediction_horizon + 1), square_root(problem.set_point_weight)[single])
         self._error = -(root @ prediction.free)
-        self._error[:, parameter.reference] = root
+        self._error[:, parameter.references] = root
         self.weighted_theta = root @ prediction.theta
-        if problem.tail_horizon > 0:
+        if problem.tail_horizon > 0 and single.any():
             tail_error, tail_theta = tail(problem, prediction, parameter)
             self._error = np.vstack([self._error, tail_error])
             self.weighted_theta = np.vstack([self.weighted_theta, tail_theta])
@@ -107,8 +108,11 @@ class CondensedQP:
         if not problem.weigh_first_move:
             self.R[:m, :m] = 0.0
         self._triangularise()
+        zones = self.bounds.zones
+        of_zones = np.zeros((0, n)) if zones is None else zones.root[:, None] * zones.theta
+        self.H = self._H + 2 * of_zones.T @ of_zones
         width = problem.limits.u_max - problem.limits.u_min
-        self.input_prefix = prefix(np.square(self.U[:, :m]).sum(axis=0), width)
+        self.input_prefix = prefix(0.5 * np.diag(self.H)[:m], width)
         self.move_prefix = np.tile(self.input_prefix, n_c)
         self.growth = self._growth(problem.model.n_states, problem.model.n_outputs)
         self.ill_conditioned = max(self.condition, self.growth) > ILL_CONDITIONED
@@ -123,7 +127,7 @@ class CondensedQP:
             )
 
         f = parameter.no_map(v + n)
-        f[:v, parameter.one] = problem.output_limit_weight
+        f[:v, parameter.one] = self.bounds.violation_cost.linear[:, None]
         f[v:] = -2 * self.U.T @ self._target
         self._u_previous = parameter.no_map(n)
         self._u_previous[:, parameter.u_previous] = np.tile(np.eye(m), (n_c, 1))
@@ -134,13 +138,15 @@ class CondensedQP:
         )  # fmt: skip
         self._constant_map = parameter.with_constant_reference(self._preview_map)
         self.map_bytes = self._preview_map.nbytes
+        errors = self._error if zones is None else np.vstack([self._error, zones.weighted_free])
         self._error_lengths = {
             of_error.shape[1]: np.linalg.norm(of_error, axis=0)
-            for of_error in (self._error, parameter.with_constant_reference(self._error))
+            for of_error in (errors, parameter.with_constant_reference(errors))
         }
         for lengths in self._error_lengths.values():
             lengths[parameter.one] += self._shift
-        self.error_of_reference = parameter.with_constant_reference(self._error)[:, parameter.one.stop :]
+        of_constant = parameter.with_constant_reference(self._error)[:, parameter.one.stop :]
+        self.error_of_reference = of_constant[:, : problem.model.n_outputs]
 
     def _triangularise(self) -> None:
         """U, the target, and rows whose squares sum up to the cost of the free optimum, the last two as maps of p."""
@@ -154,7 +160,7 @@ class CondensedQP:
                 "CondensedQP: expected a positive definite Hessian, so that weights and outputs determine every move, "
                 f"received a condition of {self.condition:.1e} squared; give every move a weight"
             )
-        self.H = 2 * (self.U.T @ self.U)
+        self._H = 2 * (self.U.T @ self.U)
         self._target = Q.T @ error
         rest = error - Q @ self._target
         lost = Q.T @ rest  # what rounding left in the range of W
@@ -179,9 +185,15 @@ class CondensedQP:
 
     def _growth(self, n: int, l: int) -> float:
         """How many times larger the outputs that a state predicts become than over the first n + 1 samples."""
-        of_state = self._error[:, self.parameter.x]
-        first, all_of_them = (np.linalg.norm(rows, axis=0) for rows in (of_state[: (n + 1) * l], of_state))
-        return float(np.max(all_of_them[first > 0] / first[first > 0], initial=1.0))
+        zones, zoned = self.bounds.zones, int(self.problem.zoned.sum())
+        parts = [(self._error, l - zoned)] + ([] if zones is None else [(zones.weighted_free, zoned)])
+        most = 1.0
+        for errors, width in parts:
+            of_state = errors[:, self.parameter.x]
+            samples = of_state[: (n + 1) * width], of_state
+            first, all_of_them = (np.linalg.norm(rows, axis=0) for rows in samples)
+            most = float(np.max(all_of_them[first > 0] / first[first > 0], initial=most))
+        return most
 
     def _optimum_maps(self, restriction: Restriction) -> dict[str, Array]:
         """The optimum without limits on a pattern: its margins, moves, inputs and residual as maps of p."""
@@ -204,7 +216,12 @@ class CondensedQP:
     def sample(self, parameter: Array, u_previous: Array, frozen: Indices | None = None) -> Sample:
         """The data of one sample, from its p; `frozen` as in `Sample`."""
         maps = self._constant_map if len(parameter) == self._constant_map.shape[1] else self._preview_map
-        return Sample(maps.dot(parameter), self.parts, parameter, u_previous, frozen)
+        data = maps.dot(parameter)
+        if self.bounds.zones is not None:  # a zone of width zero has one end, whatever rounding says
+            lower, upper = data[self.parts.lower], data[self.parts.upper]
+            rows = self.bounds.zone_rows
+            upper[rows] = np.maximum(lower[rows], upper[rows])
+        return Sample(data, self.parts, parameter, u_previous, frozen)
 
     @property
     def target_map(self) -> Array:
@@ -218,6 +235,9 @@ class CondensedQP:
         if self.n_violations:
             scaled = self.bounds.violation_scale * self.violations(sample, moves, faded=True)
             cost += self.problem.output_limit_weight * (scaled.sum() + 0.5 * (scaled @ scaled))
+            if self.bounds.zones is not None:
+                errors = self.bounds.zone_errors(moves, sample.lower, sample.upper)
+                cost += errors.dot(errors)
         return float(cost)
 
     def rounding(self, sample: Sample) -> float:
@@ -249,8 +269,19 @@ class CondensedQP:
         return LeastSquares(sample.target + delta, sample.cost + excess)
 
     def relaxed_limits(self, sample: Sample, multipliers: Array) -> tuple[Array, float]:
-        """The same as `linear` gives it."""
-        return self.linear(self.priced(sample, multipliers))
+        """The same as `linear` gives it, for heuristics: c + f' d + 1/2 d' H d.
+
+        Zones have become set points, the ones nearest to the outputs that the multipliers belong to.
+        """
+        priced, zones = self.priced(sample, multipliers), self.bounds.zones
+        if zones is None:
+            return self.linear(priced)
+        values, rows = zones.theta.dot(self.plain.optimum(priced.target)), self.bounds.zone_rows
+        nearest = zones.root * np.minimum(np.maximum(values, sample.lower[rows]), sample.upper[rows])
+        others = multipliers.copy()
+        others[rows] = 0.0
+        f, constant = self.linear(self.priced(sample, others))
+        return f - 2 * (zones.root * nearest) @ zones.theta, constant + float(nearest.dot(nearest))
 
     def linear(self, cost: LeastSquares) -> tuple[Array, float]:
         """A cost as linear term f, shape (n_moves,), and constant c, of c + f' d + 1/2 d' H d."""
@@ -258,8 +289,7 @@ class CondensedQP:
 
     def restricted(self, pattern: BoolArray) -> Restriction:
         """The problem on the moves where `pattern`, shape (n_moves,), is true."""
-        weight = self.problem.output_limit_weight
-        return Restriction(self.U, self.bounds, pattern, weight, self._time_limit)
+        return Restriction(self.U, self.bounds, pattern, self._time_limit)
 
     @cached_property
     def program(self) -> QuadraticProgram:
@@ -270,7 +300,7 @@ class CondensedQP:
         """
         v = self.n_violations
         full = np.zeros((v + self.n_moves, v + self.n_moves))
-        full[:v, :v], full[v:, v:] = self.problem.output_limit_weight * np.eye(v), self.H
+        full[:v, :v], full[v:, v:] = np.diag(self.bounds.violation_cost.curvature), self._H
         return QuadraticProgram(full, self.bounds.rows, self.bounds.n_simple)
 
     def closed_loop_poles(self) -> ComplexArray:

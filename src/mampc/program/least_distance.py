@@ -1,6 +1,6 @@
 """The program as a least distance: how far from the optimum without limits one has to go to keep them.
 
-    minimise   |delta|^2 + w sum (a + a^2 / 2)
+    minimise   |delta|^2 + sum (l a + c a^2 / 2)
     subject to lower <= [a; rows (optimum + R^-1 delta) + violations a] <= upper
 
 over the distance delta = R (moves - optimum) and the violations a, R the triangular factor of the cost. A solver
@@ -42,6 +42,18 @@ class Nearest(NamedTuple):
     violated: bool = False  # whether some violation is above zero
 
 
+class ViolationCost(NamedTuple):
+    """What violations a cost: l a + c a^2 / 2, l and c of shape (v,); those with l > 0 stand first and are >= 0."""
+
+    linear: Array
+    curvature: Array
+
+    def of(self, violations: Array) -> float:
+        return float(
+            np.maximum(violations, 0.0).dot(self.linear) + 0.5 * (self.curvature * violations).dot(violations)
+        )
+
+
 class LeastDistance:
     """One such program, to be solved again and again for new optima and bounds.
 
@@ -51,7 +63,7 @@ class LeastDistance:
         R: upper triangular factor of the cost in the moves, shape (k, k).
         rows: bounded quantities per move, shape (b, k).
         violations: the same per violation, shape (b, v).
-        weight: w.
+        cost: of the violations.
         n_simple: so many first rows are the first moves themselves; active bounds of these are kept exactly.
         time_limit: seconds that a solve may take; None for no limit.
     """
@@ -61,23 +73,24 @@ class LeastDistance:
         R: Array,
         rows: Array,
         violations: Array,
-        weight: float,
+        cost: ViolationCost,
         *,
         n_simple: int = 0,
         time_limit: float | None = None,
     ) -> None:
         v, k = violations.shape[1], len(R)
         self._R, self._violations = R, violations
-        self._v, self._weight, self._rows, self._n_simple = v, weight, np.ascontiguousarray(rows), n_simple
+        self._v, self._cost, self._rows, self._n_simple = v, cost, np.ascontiguousarray(rows), n_simple
+        self._limited = int(np.count_nonzero(cost.linear))
         self._inverse = np.linalg.solve(R, np.eye(k))
-        self._per_violation = np.sqrt(2 / weight)  # of its coordinate in which its curvature is 2 as well
+        self._per_violation = np.sqrt(2 / cost.curvature)  # of its coordinate of curvature 2
         A = np.hstack([violations * self._per_violation, rows @ self._inverse])
         length = np.sqrt(np.square(A).sum(axis=1))
         # Powers of two change no digit.
         even = 2.0 ** -np.round(np.log2(np.where(length > 0, length, 1.0)))
         self._A, self._even_rows = A * even[:, None], rows * even[:, None]
-        self._even = np.concatenate([np.full(v, 1 / self._per_violation), even])
-        self._f = np.concatenate([np.full(v, weight * self._per_violation), np.zeros(k)])
+        self._even = np.concatenate([1 / self._per_violation, even])
+        self._f = np.concatenate([cost.linear * self._per_violation, np.zeros(k)])
         self._solver = DaqpSolver(
             QuadraticProgram(2 * np.eye(v + k), self._A, v),
             time_limit=time_limit,
@@ -92,8 +105,9 @@ class LeastDistance:
         if far <= 0:
             return Nearest(optimum, 0.0, np.zeros(len(low)), QPStatus.OPTIMAL, 0)
         f, v, scale = self._f, self._v, 1.0
-        # Violations have a size of their own, 1: nothing smaller is enlarged then.
-        if far > (1.0 if v else 0.0) and isfinite(far):
+        limited = self._limited
+        # Violations of limits have a size of their own, 1: nothing smaller is enlarged then.
+        if far > (1.0 if limited else 0.0) and isfinite(far):
             scale = float(2.0 ** frexp(far)[1])
             f, low, high = f / scale, low / scale, high / scale
         self._solver.start(active)
@@ -104,9 +118,9 @@ class LeastDistance:
                 return self._tried_again(optimum, lower, upper, solution)
             return Nearest(None, np.inf, None, status, iterations)
         delta = z[v:] * scale
-        excess, violated = float(delta.dot(delta)), v > 0 and max(z[:v].tolist()) > 0
-        if violated:
-            excess += self._penalty(z[:v] * (scale * self._per_violation))
+        excess, violated = float(delta.dot(delta)), limited > 0 and max(z[:limited].tolist()) > 0
+        if violated or v > limited:
+            excess += self._cost.of(z[:v] * (scale * self._per_violation))
         multipliers = pull * (scale * self._even)
         if self._doubtful:
             slack = np.where(pull > 0, high, low)[v:] - self._A.dot(z)
@@ -118,10 +132,6 @@ class LeastDistance:
             if force:
                 moves[i] = (upper if force > 0 else lower)[v + i]
         return Nearest(moves, excess, multipliers, status, iterations, violated)
-
-    def _penalty(self, violations: Array) -> float:
-        a = np.maximum(violations, 0.0)
-        return self._weight * float(a.sum() + 0.5 * a.dot(a))
 
     @cached_property
     def _doubtful(self) -> bool:
@@ -150,20 +160,21 @@ class LeastDistance:
         self, optimum: Array, lower: Array, upper: Array, multipliers: Array, iterations: int
     ) -> Nearest:
         """The solution made exact from active bounds, those that multipliers tell; FAILED where that does not end."""
-        v, k, root = self._v, len(self._R), np.sqrt(self._weight / 2)
+        v, k, root = self._v, len(self._R), np.sqrt(self._cost.curvature / 2)
         F, A = np.zeros((v + k, v + k)), np.zeros((len(lower), v + k))
-        F[:v, :v], F[v:, v:] = root * np.eye(v), self._R
+        F[:v, :v], F[v:, v:] = np.diag(root), self._R
         A[:v, :v], A[v:, :v], A[v:, v:] = np.eye(v), self._violations, self._rows
         reached = self._R.dot(optimum)
-        c = np.concatenate([np.full(v, -root), reached])
+        c = np.concatenate([-0.5 * self._cost.linear / root, reached])
         better = refined(F, c, A, lower, upper, multipliers, MOST_ROUNDS)
         if better is None:
             return Nearest(None, np.inf, None, QPStatus.FAILED, iterations)
         moves = better.z[v:]
         delta = self._R.dot(moves) - reached
-        excess, violated = float(delta.dot(delta)), bool(v and better.z[:v].max() > 0)
-        if violated:
-            excess += self._penalty(better.z[:v])
+        limited = self._limited
+        excess, violated = float(delta.dot(delta)), bool(limited and better.z[:limited].max() > 0)
+        if violated or v > limited:
+            excess += self._cost.of(better.z[:v])
         return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated)
 
     def relaxed(self, distances: tuple[Array, Array], multipliers: Array) -> tuple[Array, float]:

@@ -2,7 +2,8 @@
 
     p = (x, u_prev, u_prev - u_op, d_u, d_y, v - v_op, 1, r - y_op)
 
-with r either one reference (l,) that holds over the horizon, or r_0 .. r_np one after the other. Deviations from the
+with r either one reference (l,) that holds over the horizon, or r_0 .. r_np one after the other; where outputs have a
+zone, each r holds the ends of these (see `zone.ZoneEnds`). Deviations from the
 operating point are taken before anything is multiplied: large responses of an integrator would turn the rounding of
 absolute values into errors.
 """
@@ -15,6 +16,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_shaped
 from mampc.program.problem import TrackingProblem
+from mampc.program.zone import Zone, ZoneEnds
 
 
 class Parameter:
@@ -27,27 +29,35 @@ class Parameter:
         input_disturbance, output_disturbance: m and l entries.
         measured_disturbance: d entries, from the operating point.
         one: the constant 1.
-        reference: (np + 1) l entries, from the operating point.
-        final_reference: the last l of them.
+        reference: (np + 1) l entries, from the operating point; with zones the ends of each sample.
+        references: where r_0 .. r_np stand, the lower ends of zones among them, ((np + 1) l,).
+        final_reference: the last l of `references`.
+        lower_ends, upper_ends: where those of zoned outputs stand, sample by sample.
         size: of p.
         origin: what is subtracted from engineering units, by the length of p.
     """
 
     def __init__(self, problem: TrackingProblem) -> None:
         model = problem.model
-        m, l, self._n_outputs = model.n_inputs, model.n_outputs, model.n_outputs
-        sizes = [model.n_states, m, m, m, l, len(model.v_op), 1, (problem.prediction_horizon + 1) * l]
+        m, l, zoned = model.n_inputs, model.n_outputs, np.flatnonzero(problem.zoned)
+        samples, width = problem.prediction_horizon + 1, l + len(zoned)
+        self._samples, self._width = samples, width
+        self._problem = problem
+        self._ends = ZoneEnds(problem) if len(zoned) else None
+        sizes = [model.n_states, m, m, m, l, len(model.v_op), 1, samples * width]
         ends = np.cumsum(sizes).tolist()
         (
             self.x, self.u_previous, self.u_deviation, self.input_disturbance, self.output_disturbance,
             self.measured_disturbance, self.one, self.reference,
         ) = (slice(end - size, end) for size, end in zip(sizes, ends, strict=True))  # fmt: skip
         self.size = ends[-1]
-        self.final_reference = slice(self.size - l, self.size)
+        at = self.reference.start + np.arange(samples * width).reshape(samples, width)
+        self.references, self.final_reference = at[:, :l].ravel(), at[-1, :l]
+        self.lower_ends, self.upper_ends = at[:, zoned].ravel(), at[:, l:].ravel()
         origin = np.zeros(self.size)
         origin[self.u_deviation], origin[self.measured_disturbance] = model.u_op, model.v_op
-        origin[self.reference] = np.tile(model.y_op, problem.prediction_horizon + 1)
-        self.origin = {len(at): at for at in (origin, origin[: self.reference.start + l])}
+        origin[self.reference] = np.tile(np.concatenate([model.y_op, model.y_op[zoned]]), samples)
+        self.origin = {len(of): of for of in (origin, origin[: self.reference.start + width])}
         usual = np.zeros(self.size)  # no disturbances, and the measured ones of the operating point
         usual[self.measured_disturbance], usual[self.one] = model.v_op, 1.0
         self._usual = {len(at): usual[: len(at)] for at in self.origin.values()}
@@ -62,7 +72,12 @@ class Parameter:
         input_disturbance: Any = None,
         measured_disturbance: Any = None,
     ) -> Array:
-        """p; all arguments in engineering units, the reference (l,) or (np + 1, l), disturbances may be left out."""
+        """p; all arguments in engineering units, the reference (l,) or (np + 1, l), disturbances may be left out.
+
+        With zones the reference may have their ends in its place.
+        """
+        if self._ends is not None:
+            reference = self.with_ends(reference)
         if reference.ndim == 2:
             reference = reference.ravel()
         start, sizes = self.reference.start, self._sizes
@@ -84,6 +99,16 @@ class Parameter:
         vector -= self.origin[size]
         return vector
 
+    def with_ends(self, reference: Array) -> Array:
+        """What stands in p for references of shape (..., l): with zones their ends, shape (..., l + zoned)."""
+        if self._ends is None or reference.shape[-1] == self._width:
+            return reference
+        return self._ends.about(reference)
+
+    def of_zone(self, zone: Zone) -> Array:
+        """What stands in p for a zone; `MampcError` if it does not fit the problem."""
+        return (ZoneEnds(self._problem) if self._ends is None else self._ends).of(zone)
+
     def no_map(self, rows: int) -> Array:
         """A map of p to `rows` zeros, shape (rows, size), to be filled in."""
         return np.zeros((rows, self.size))
@@ -91,5 +116,5 @@ class Parameter:
     def with_constant_reference(self, preview_map: Array) -> Array:
         """The map of a p whose reference has shape (l,): the columns of all samples summed up."""
         start, rows = self.reference.start, len(preview_map)
-        constant = preview_map[:, start:].reshape(rows, -1, self._n_outputs).sum(axis=1)
+        constant = preview_map[:, start:].reshape(rows, self._samples, self._width).sum(axis=1)
         return np.hstack([preview_map[:, :start], constant])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import as_limit, as_number, as_vector, as_weight, as_whole
+from mampc.base.checks import Array, BoolArray, as_limit, as_number, as_vector, as_weight, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.systems.state_space import StateSpace
 
@@ -86,6 +86,9 @@ class TrackingProblem:
     zero whenever the limits can be kept and w is large enough. rho falls evenly from 1 at i = 1 to 1/2 at np, so
     that an output that is outside already is worth bringing back.
 
+    An output with a zone has a range r_i - zone_below .. r_i + zone_above instead of the reference r_i: its error is
+    the distance to that range, nothing inside.
+
     Args:
         model: a discrete-time `StateSpace`.
         prediction_horizon: np >= 1, in samples.
@@ -104,6 +107,10 @@ class TrackingProblem:
             weighs against Q an output's offset pays for. Inputs count on in the tail, L samples at their last value.
         u_cost: c, the cost of a unit of each input at each sample, a scalar or one per input, counted from the limit
             towards which it pulls: u_min where positive, u_max where negative, which has to be there.
+        zone_below, zone_above: how far outputs may be below and above their reference at no cost, in output units, a
+            scalar or one per output, infinite for no end at that side; 0 and 0 (the default) for a set point. The
+            reference moves the zone; `Zone` gives another one for a sample. Outputs with a zone need an output_weight
+            without products with others.
 
     Raises:
         MampcError: anything that does not fit the model or the horizons.
@@ -121,6 +128,8 @@ class TrackingProblem:
     u_target: Any = field(default=None, kw_only=True)
     u_target_weight: Any = field(default=0.0, kw_only=True)
     u_cost: Any = field(default=0.0, kw_only=True)
+    zone_below: Any = field(default=0.0, kw_only=True)
+    zone_above: Any = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, StateSpace):
@@ -160,9 +169,12 @@ class TrackingProblem:
             "u_target_weight": as_weight("u_target_weight", self.u_target_weight, m),
             "u_target": None if self.u_target is None else as_vector("u_target", self.u_target, m),
             "u_cost": as_vector("u_cost", self.u_cost, m),
+            "zone_below": as_limit("zone_below", self.zone_below, l, np.inf),
+            "zone_above": as_limit("zone_above", self.zone_above, l, np.inf),
         }.items():
             object.__setattr__(self, name, value)
         self._check_input_cost()
+        self._check_zones()
         for array in vars(self).values():
             if isinstance(array, np.ndarray):
                 array.flags.writeable = False
@@ -184,6 +196,31 @@ class TrackingProblem:
                     f"{self.u_cost} and {side} {limit}"
                 )
 
+    def _check_zones(self) -> None:
+        for name in ("zone_below", "zone_above"):
+            width = getattr(self, name)
+            if (width < 0).any():
+                raise MampcError(f"{name}: expected at least 0, received {width}")
+        zoned = self.zoned
+        off_diagonal = self.output_weight - np.diag(np.diag(self.output_weight))
+        if off_diagonal[zoned].any():
+            raise MampcError(
+                "output_weight: expected no products of outputs that have a zone with others, received "
+                f"{shown(self.output_weight.tolist())}; give them a diagonal weight"
+            )
+
+    @property
+    def zoned(self) -> BoolArray:
+        """Which outputs have a zone and count, shape (l,)."""
+        wide: BoolArray = (self.zone_below > 0) | (self.zone_above > 0)
+        return wide & (np.diag(self.output_weight) > 0)
+
+    @property
+    def set_point_weight(self) -> Array:
+        """Q of the outputs without a zone, zero elsewhere, shape (l, l)."""
+        single = ~self.zoned
+        return np.where(np.outer(single, single), self.output_weight, 0.0)
+
     @property
     def prices_inputs(self) -> bool:
         """Whether inputs cost something where they are, by a target or a price."""
@@ -201,5 +238,6 @@ class TrackingProblem:
             told += [f"{name}={value!r}"] if value != usual else []
         if self.u_target is not None:
             told += [f"{name}={_short(getattr(self, name))}" for name in ("u_target", "u_target_weight")]
-        told += [f"u_cost={_short(self.u_cost)}"] if self.u_cost.any() else []
+        for name in ("u_cost", "zone_below", "zone_above"):
+            told += [f"{name}={_short(getattr(self, name))}"] if getattr(self, name).any() else []
         return f"TrackingProblem({', '.join(told)})"

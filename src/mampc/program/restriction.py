@@ -18,7 +18,7 @@ class Restriction:
     Input rows at samples where that input does not move repeat earlier ones and are left out.
 
     Attributes:
-        n_violations: how many outputs are limited.
+        n_violations: of `Bounds`.
         moves: the moves of the pattern, in order, shape (k,).
         bounds: the bounds that are kept, shape (kept,); those of the violations come first.
         rows: bounded quantities per move, violations left out, shape (kept - violations, k).
@@ -30,16 +30,13 @@ class Restriction:
     Args:
         U, bounds: of `CondensedQP`.
         pattern: shape (n_moves,).
-        weight: of the violations.
         time_limit: seconds that one program may take; None for no limit.
     """
 
-    def __init__(
-        self, U: Array, bounds: Bounds, pattern: BoolArray, weight: float, time_limit: float | None = None
-    ) -> None:
+    def __init__(self, U: Array, bounds: Bounds, pattern: BoolArray, time_limit: float | None = None) -> None:
         v = self.n_violations = bounds.n_violations
         n_simple = bounds.n_simple
-        self.moves, self._n_bounds, self._weight = np.flatnonzero(pattern), bounds.size, weight
+        self.moves, self._n_bounds, self._cost = np.flatnonzero(pattern), bounds.size, bounds.violation_cost
         move = bounds.move_of_bound
         kept = np.where(move < 0, True, pattern[np.maximum(move, 0)])
         kept[v:n_simple] = pattern[: n_simple - v]
@@ -73,7 +70,7 @@ class Restriction:
     def program(self) -> LeastDistance:
         """Its program within the bounds that are kept."""
         return LeastDistance(
-            self.R, self.rows, self.violations, self._weight,
+            self.R, self.rows, self.violations, self._cost,
             n_simple=self._n_simple, time_limit=self._time_limit,
         )  # fmt: skip
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.base.errors import MampcError
 from mampc.program.daqp import DaqpSolver
 from mampc.program.parameter import Parameter
 from mampc.program.problem import TrackingProblem
@@ -68,6 +69,10 @@ class SteadyTarget:
     """Finds the steady target of a problem's model; one small program a change of reference or disturbance."""
 
     def __init__(self, problem: TrackingProblem, parameter: Parameter) -> None:
+        if problem.zoned.any():
+            raise MampcError(
+                "problem: expected set points for a steady target, received outputs with a zone_below or zone_above"
+            )
         self._problem, self._parameter = problem, parameter
         model = problem.model
         n, m, l = model.n_states, model.n_inputs, model.n_outputs

@@ -201,6 +201,10 @@ class QuietZone(Predicted):
 
     def __init__(self, controller: Controller, *, band: Any) -> None:
         super().__init__(controller)
+        if self.problem.zoned.any():
+            raise MampcError(
+                "controller: expected one with set points, received outputs that have a zone already"
+            )
         self._band = as_vector("band", band, self.problem.model.n_outputs)
         if (self._band < 0).any():
             raise MampcError(f"band: expected values of at least 0, received {band!r}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mampc.base.checks import Array
@@ -25,12 +27,13 @@ def cautions(study: Study, problem: TrackingProblem, reference: Array) -> tuple[
         problem: that all of them have.
         reference: shape (steps, l), in engineering units.
     """
-    condensed = CondensedQP(problem)
+    # A zone is as good as a set point for what happens beyond it.
+    condensed = CondensedQP(replace(problem, zone_below=0.0, zone_above=0.0))
     levels = np.unique(np.vstack([problem.model.y_op, reference]), axis=0)[:MOST_LEVELS]
     return (
         *_unstable(study, condensed),
         *_late(study),
-        *_out_of_reach(condensed, levels),
+        *_out_of_reach(condensed, levels, problem),
         *_never_pays(study, condensed, levels),
     )
 
@@ -66,8 +69,8 @@ def _late(study: Study) -> list[str]:
     return [f"after the last sample, which is {study.steps - 1}: {', '.join(late)}"] if late else []
 
 
-def _out_of_reach(condensed: CondensedQP, levels: Array) -> list[str]:
-    """Outputs whose reference no steady inputs within their limits reach, by the model."""
+def _out_of_reach(condensed: CondensedQP, levels: Array, zones: TrackingProblem) -> list[str]:
+    """Outputs whose reference or zone no steady inputs within their limits reach, by the model."""
     problem = condensed.problem
     model, parameter = problem.model, condensed.parameter
     target = SteadyTarget(problem, parameter)
@@ -76,7 +79,8 @@ def _out_of_reach(condensed: CondensedQP, levels: Array) -> list[str]:
     worst = np.zeros(model.n_outputs)
     for level in levels:
         reached = target.at(parameter.vector(np.zeros(model.n_states), u_op, level)).y
-        worst = np.maximum(worst, np.abs(reached - level))
+        apart = reached - level
+        worst = np.maximum(worst, np.maximum(apart - zones.zone_above, -apart - zones.zone_below))
     return [
         f"the reference of {name} is up to {missed:.3g} away from what the inputs can hold within their limits, by the "
         "model; widen the limits or move it"

@@ -85,6 +85,8 @@ Time = Annotated[float, BeforeValidator(time_in_seconds), Field(gt=0, allow_inf_
 Lag = Annotated[float, BeforeValidator(time_in_seconds), Field(ge=0, allow_inf_nan=False)]
 Rate = Annotated[float, BeforeValidator(_rate), Field(gt=0, allow_inf_nan=False)]
 Values = Number | list[Number]
+Width = Annotated[float, Field(ge=0)]  # may be infinite
+Widths = Width | list[Width]
 Weight = Number | list[Number] | list[list[Number]]
 Word = Annotated[str, Field(min_length=1, max_length=80)]
 Name = Annotated[Word, AfterValidator(_short_as_file)]
@@ -147,6 +149,8 @@ class ProblemTable(Table):
     u_target: Values | None = None
     u_target_weight: Weight = 0.0
     u_cost: Values = 0.0
+    zone_below: Widths = 0.0
+    zone_above: Widths = 0.0
 
 
 class ChangeTable(Table):

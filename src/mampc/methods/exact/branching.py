@@ -21,6 +21,7 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.methods.exact.sample_problem import SampleProblem
+from mampc.methods.exact.zone_curvature import ZoneCurvature
 from mampc.program.sample import Indices
 
 UNDECIDED, OUT, MADE = 0, 1, 2
@@ -56,6 +57,9 @@ class Branching:
         if dwell > 1:
             apart = np.abs(self._at[:, None] - self._at)
             self._near = (apart < dwell) & (order[:, None] % m == order % m) & (apart > 0)
+        squares, sample = problem.squares, problem.sample
+        zoned = squares.condensed.bounds.zones is not None
+        self._zones = ZoneCurvature(squares.condensed, squares.normal, order, sample) if zoned else None
         self._tried: set[bytes] = set()
         self._failed = False  # whether a program had no answer
 
@@ -163,7 +167,7 @@ class Branching:
         s = np.where(domain.bounded | ~within, found.pulls, 0.0)
         _, rest = self._problem.terms.priced(found, s)
         support = np.maximum(np.maximum(s * low, s * high), 0.0)
-        variance = np.einsum("iq,iq->i", Z, Z)
+        variance = np.einsum("iq,iq->i", Z, Z) if self._zones is None else self._zones.variance(d, within)
         out = d * d / np.where(variance > 0, variance, np.inf)
         if of.simultaneous:
             bound, adds = self._of_samples(rest, support, undecided, paid)

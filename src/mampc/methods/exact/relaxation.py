@@ -79,7 +79,7 @@ class Relaxation:
             factor,
             np.vstack([np.eye(n), bounds.rows[:, v:][:, order]]),
             np.vstack([np.zeros((n, v)), bounds.rows[:, :v]]),
-            condensed.problem.output_limit_weight,
+            bounds.violation_cost,
             n_simple=n,
             time_limit=time_limit,
         )

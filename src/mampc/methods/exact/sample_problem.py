@@ -29,6 +29,7 @@ class SampleProblem:
         relaxation: its relaxed programs.
         terms: what nodes are bounded with.
         best: the best plan so far.
+        deadline: of `perf_counter`.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class SampleProblem:
     ) -> None:
         self.squares, self.admissible, self.order = squares, admissible, squares.order
         self.sample, self.allowance, self.best = sample, allowance, best
-        self._solver, self._deadline = solver, deadline
+        self._solver, self.deadline = solver, deadline
         self._lasting_from = perf_counter() + SOON * (deadline - perf_counter())
         self.domain = Domain(squares.condensed, admissible, self.order, sample, allowance)
         self.prefix = squares.condensed.move_prefix[self.order]
@@ -61,7 +62,7 @@ class SampleProblem:
     @property
     def late(self) -> bool:
         """Whether the time is up."""
-        return perf_counter() > self._deadline
+        return perf_counter() > self.deadline
 
     @property
     def lasting(self) -> bool:
@@ -83,6 +84,6 @@ class SampleProblem:
 
         `within`: intervals of its moves that tell their signs.
         """
-        solved = self._solver.solve(self.sample, pattern, self.best.objective, self._deadline, within=within)
+        solved = self._solver.solve(self.sample, pattern, self.best.objective, self.deadline, within=within)
         self.best.offer(solved)
         return self.relaxation.of_bounds(solved.multipliers)

@@ -71,7 +71,9 @@ class ExactSearch:
         # After a move of more than half its range an input can only go back; the tree knows where inputs are.
         limits, size = problem.limits, self.admissible.min_size[: problem.model.n_inputs]
         coarse = bool((2 * size > limits.u_max - limits.u_min).any())
-        self._ranking = None if coarse else ranking_of(condensed, self.admissible)
+        # Zones give patterns no bound that needs no solver.
+        zoned = condensed.bounds.zones is not None and not self.admissible.sized
+        self._ranking = None if coarse or zoned else ranking_of(condensed, self.admissible)
         self._solver = PatternSolver(condensed, self.admissible)
         if self._ranking is None:
             self._tree = PatternTree(condensed, self.admissible, self._solver, settings.time_limit)

@@ -55,6 +55,8 @@ class PatternTree:
         # A price per unit says little of moves that can be large.
         limits = condensed.problem.limits
         self._close = admissible.priced and not admissible.sized and bool(np.isfinite(limits.du_max).any())
+        # Relaxed without their bounds, errors of zones tell nothing.
+        self._zoned = condensed.bounds.zones is not None and not admissible.sized
 
     def search(self, sample: Sample, allowance: Allowance, best: Incumbent, deadline: float) -> float:
         """Visit every admissible pattern that may cost less than the best plan, to which better ones are offered.
@@ -71,6 +73,8 @@ class PatternTree:
         problem.offer(problem.pattern(np.zeros(0, dtype=np.intp)))
         if not (allowance.left > 0 and len(problem.order)):
             return np.inf
+        if self._zoned:
+            return self._search_zones(problem)
         limited = bool(sample.margins.min(initial=np.inf) < 0)
         if limited or self._admissible.priced:
             self._relax_root(problem)
@@ -83,6 +87,17 @@ class PatternTree:
         if found is not None and found.active:
             terms.add(found)
         return _BatchSearch(problem).run()
+
+    def _search_zones(self, problem: SampleProblem) -> float:
+        """The search where outputs have zones, from what a local search finds with set points in place of these."""
+        if problem.terms.rest[0] >= problem.cutoff:
+            return np.inf
+        sample, plain = problem.sample, self._squares.condensed.plain
+        multipliers = plain.solve(sample.moves, sample.lower, sample.upper).multipliers
+        if multipliers is not None:
+            f, _ = self._squares.condensed.relaxed_limits(sample, multipliers)
+            self._local.offer(self._solver, sample, f, problem.allowance, problem.best, problem.deadline)
+        return Branching(problem).run()
 
     def _relax_root(self, problem: SampleProblem) -> None:
         """Bound everything with limits and prices as a relaxed program has them, and try its moves."""

@@ -1,0 +1,89 @@
+"""Zones as references: ranges of outputs, and how the parameter of a sample holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import LARGEST, Array, as_read
+from mampc.base.errors import MampcError
+from mampc.program.problem import TrackingProblem
+
+FAR = LARGEST / 4  # of an end: as good as none
+
+
+@dataclass(frozen=True, eq=False)
+class Zone:
+    """A reference that is a range: outputs between low and high cost nothing.
+
+    Args:
+        low, high: in output units, each shape (l,), or (np + 1, l) when known ahead; infinite where there is no such
+            end. Outputs without a zone in the problem have one value, low = high.
+
+    Raises:
+        MampcError: no numbers, shapes that differ, or low above high.
+    """
+
+    low: Any
+    high: Any
+
+    def __post_init__(self) -> None:
+        low, high = as_read("low", self.low), as_read("high", self.high)
+        if low.shape != high.shape or low.ndim not in (1, 2):
+            raise MampcError(
+                f"Zone: expected low and high of the same shape, (l,) or (np + 1, l), received {low.shape} and "
+                f"{high.shape}"
+            )
+        if (low > high).any():
+            raise MampcError(f"Zone: expected low <= high, received {low} and {high}")
+        for name, value in (("low", low), ("high", high)):
+            kept = value.copy()
+            kept.setflags(write=False)
+            object.__setattr__(self, name, kept)
+
+
+class ZoneEnds:
+    """The ends of zones as the parameter of a sample holds them: those of outputs without one are the reference.
+
+    The lower ends of all outputs stand first, then the upper ones of zoned outputs; infinite ones are large numbers.
+    """
+
+    def __init__(self, problem: TrackingProblem) -> None:
+        self._zoned = np.flatnonzero(problem.zoned)
+        self._single = ~problem.zoned
+        widths = (problem.zone_below, problem.zone_above)
+        self._below, self._above = (np.minimum(width[self._zoned], 4 * FAR) for width in widths)
+        l, n_p = len(problem.zoned), problem.prediction_horizon
+        self._shapes = ((l,), (n_p + 1, l))
+
+    def about(self, reference: Array) -> Array:
+        """The zones that go with a reference, shape (..., l)."""
+        own = reference[..., self._zoned]
+        own = np.where(np.abs(own) < LARGEST, own, np.nan)  # no zone hides that it is no reference
+        return self._ends(reference, own - self._below, own + self._above)
+
+    def of(self, zone: Zone) -> Array:
+        """Those that are given as such, shape (l + zoned,) or (np + 1, l + zoned).
+
+        Raises:
+            MampcError: another shape, or ranges of outputs that have no zone in the problem.
+        """
+        if zone.low.shape not in self._shapes:
+            raise MampcError(
+                f"reference: expected a Zone of shape {' or '.join(map(str, self._shapes))}, received {zone.low.shape}"
+            )
+        low, high = zone.low[..., self._single], zone.high[..., self._single]
+        if ((low != high) & ~(np.isnan(low) | np.isnan(high))).any():
+            raise MampcError(
+                "reference: expected ranges only of outputs that have a zone in the problem, received others; give "
+                "these a zone_below or zone_above"
+            )
+        return self._ends(zone.low, zone.low[..., self._zoned], zone.high[..., self._zoned])
+
+    def _ends(self, reference: Array, low: Array, high: Array) -> Array:
+        """All ends, with those of zoned outputs given; beyond FAR there is none."""
+        ends = np.concatenate([reference, np.minimum(high, FAR)], axis=-1)
+        ends[..., self._zoned] = np.maximum(low, -FAR)
+        return ends

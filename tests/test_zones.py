@@ -1,0 +1,368 @@
+"""Zones: what outputs in and beside them cost, against independent programs, in every method and loop."""
+
+import pickle
+import warnings
+from dataclasses import replace
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import mampc
+from builders import cost_of, distance, predicted, random_model, tank_model, tank_problem
+from mampc import Status
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.pattern_solver import PatternSolver
+from mampc.program.condensing import CondensedQP
+from mampc.study import parse_study, run_study, template
+from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
+
+INF = np.inf
+PLAIN = mampc.MoveRules()
+
+
+def random_problem(seed, **changes):
+    """A problem with zones of all kinds, one-sided ones among them, some with limits; a state and a reference."""
+    rng = np.random.default_rng(seed)
+    model = random_model(seed, m=2, l=2, feedthrough=seed % 5 == 0)
+    limits = mampc.Limits()
+    if seed % 2:
+        limits = mampc.Limits(u_min=model.u_op - 1, u_max=model.u_op + 1)
+    if seed % 6 == 1:
+        limits = replace(limits, y_max=model.y_op + 1.5)
+    settings = {
+        "prediction_horizon": 7, "control_horizon": 3, "limits": limits, "output_weight": rng.uniform(0.5, 2, 2),
+        "zone_below": [0.5, [0.3, 0.0, INF][seed % 3]], "zone_above": [[0.2, INF][seed % 2], [0.1, 0.0][seed % 2]],
+    }  # fmt: skip
+    problem = mampc.TrackingProblem(model, **settings | changes)
+    return problem, rng.standard_normal(model.n_states), model.y_op + 2 * rng.standard_normal(2), rng
+
+
+def sampled(problem, x, reference):
+    condensed = CondensedQP(problem)
+    u = problem.model.u_op
+    return condensed, condensed.sample(condensed.parameter.vector(x, u, reference), u)
+
+
+def by_cvxpy(problem, x, low, high, pattern):
+    """The least cost on a pattern (nc, m) from the operating point, as squared distances to zones; without y limits."""
+    model, limits, n_c = problem.model, problem.limits, problem.control_horizon
+    d, kept, cost = cp.Variable((n_c, model.n_inputs)), [], 0.0
+    u = [model.u_op + cp.sum(d[: j + 1], axis=0) for j in range(n_c)]
+    for j in range(n_c):
+        cost += cp.quad_form(d[j], cp.psd_wrap(problem.move_weight))
+        kept += [d[j, a] == 0 for a in np.flatnonzero(~pattern[j])]
+        kept += [u[j][a] <= limits.u_max[a] for a in np.flatnonzero(np.isfinite(limits.u_max))]
+        kept += [u[j][a] >= limits.u_min[a] for a in np.flatnonzero(np.isfinite(limits.u_min))]
+    for i in range(problem.prediction_horizon + 1):
+        at = u[min(i, n_c - 1)] - model.u_op
+        y = model.y_op + model.C @ x + model.D @ at
+        for k, weight in enumerate(np.diag(problem.output_weight)):
+            below = low[k] - y[k] if np.isfinite(low[k]) else -1.0
+            above = y[k] - high[k] if np.isfinite(high[k]) else -1.0
+            cost += weight * cp.square(cp.pos(cp.maximum(below, above)))
+        x = model.A @ x + model.B @ at
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return cp.Problem(cp.Minimize(cost), kept).solve(solver=cp.CLARABEL)
+
+
+@pytest.mark.parametrize("seed", [s for s in range(12) if s % 6 != 1])
+def test_the_program_on_a_pattern_is_that_of_squared_distances(seed):
+    problem, x, reference, rng = random_problem(seed)
+    condensed, sample = sampled(problem, x, reference)
+    solver = PatternSolver(condensed, AdmissiblePatterns(PLAIN, 2, 3))
+    for _ in range(2):
+        pattern = rng.random((3, 2)) < 0.6
+        found = solver.solve(sample, pattern.ravel())
+        plan = problem.model.u_op + found.moves.reshape(3, 2).cumsum(axis=0)
+        cost = cost_of(problem, x, problem.model.u_op, reference, plan)
+        assert found.objective == pytest.approx(cost, rel=1e-9, abs=1e-12)
+        ends = reference - problem.zone_below, reference + problem.zone_above
+        assert found.objective == pytest.approx(by_cvxpy(problem, x, *ends, pattern), rel=1e-6, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        mampc.MoveRules(price=0.2), mampc.MoveRules(max_moves=2), mampc.MoveRules(price=0.05, counting="simultaneous"),
+        mampc.MoveRules(price=0.1, dwell=2, max_moves_per_step=1), mampc.MoveRules(price=0.1, min_size=0.2),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_the_exact_optimum_is_that_of_brute_force(rules):
+    for seed in range(3 if rules.min_size else 6):
+        problem, x, reference, _ = random_problem(seed)
+        sparse = mampc.MAMPC(problem, rules)
+        state = sparse.initial_state()
+        decision = sparse.step(state, x, reference)
+        past = state.inputs
+        assert decision.status is Status.OPTIMAL
+        objective = objective_of(problem, rules, x, past, reference, decision.plan)
+        assert decision.objective == pytest.approx(objective, rel=1e-9)
+        prices = [charge(rules, p) if keeps_rules(rules, past, p) else INF for p in all_patterns(3, 2)]
+        costs = best_on_every_pattern(problem, rules, x, past[-1], reference)
+        assert decision.objective == pytest.approx(min(costs + prices), rel=1e-6)
+
+
+def test_the_exact_optimum_is_that_of_scip():
+    problem, x, reference, _ = random_problem(3, control_horizon=4)
+    rules = mampc.MoveRules(price=0.2)
+    sparse = mampc.MAMPC(problem, rules)
+    low, high = scip_bounds(problem, rules, x, problem.model.u_op, reference, 20.0)
+    objective = sparse.step(sparse.initial_state(), x, reference).objective
+    assert low - 1e-6 <= objective <= high + 1e-6
+
+
+@pytest.mark.parametrize("method", mampc.METHODS)
+def test_every_method_plans_with_zones_and_can_be_certified(method):
+    settings = {} if method == "exact" else {"certify": True}
+    if method == "alternating":
+        settings |= {"warm_up": 0}
+    rules = mampc.MoveRules(price=0.1, max_moves=4, sparsity_horizon=2)
+    for seed in range(4):
+        problem, x, reference, _ = random_problem(seed)
+        sparse = mampc.MAMPC(problem, rules, method=method, **settings)
+        exact = mampc.MAMPC(problem, rules)
+        best = exact.step(exact.initial_state(), x, reference).objective
+        decision = sparse.step(sparse.initial_state(), x, reference)
+        cost = objective_of(problem, rules, x, sparse.initial_state().inputs, reference, decision.plan)
+        assert decision.objective == pytest.approx(cost, rel=1e-8)
+        assert decision.lower_bound == pytest.approx(best, rel=1e-8)
+        assert decision.objective >= best * (1 - 1e-9)
+
+
+def test_local_search_is_near_the_optimum():
+    gaps = []
+    for seed in range(30):
+        problem, x, reference, _ = random_problem(seed)
+        greedy = mampc.MAMPC(problem, mampc.MoveRules(price=0.2), method="greedy", certify=True)
+        gaps.append(greedy.step(greedy.initial_state(), x, reference).gap)
+    assert np.median(gaps) < 0.01
+
+
+def test_a_set_point_is_a_zone_of_width_zero():
+    for seed in range(10):
+        problem, x, reference, _ = random_problem(seed)
+        point = mampc.TrackingProblem(
+            problem.model, prediction_horizon=7, control_horizon=3, limits=problem.limits,
+            output_weight=problem.output_weight,
+        )  # fmt: skip
+        expected, zones = mampc.MPC(point), mampc.MPC(problem)
+        expected = expected.step(expected.initial_state(), x, reference)
+        decision = zones.step(zones.initial_state(), x, mampc.Zone(reference, reference))
+        np.testing.assert_allclose(decision.plan, expected.plan, atol=1e-8)
+        assert decision.objective == pytest.approx(expected.objective, rel=1e-9)
+
+
+def test_a_tail_is_nearly_that_of_a_set_point_where_the_zone_has_width_zero():
+    for seed in range(6):
+        problem, x, reference, _ = random_problem(seed, tail_horizon=9.0)
+        point = replace(problem, zone_below=0.0, zone_above=0.0)
+        expected, zones = mampc.MPC(point), mampc.MPC(problem)
+        expected = expected.step(expected.initial_state(), x, reference)
+        decision = zones.step(zones.initial_state(), x, mampc.Zone(reference, reference))
+        assert decision.objective == pytest.approx(expected.objective, rel=0.05)
+
+
+def test_the_tail_counts_means_over_doubling_pieces_of_it():
+    for seed in range(6):
+        L = 5.0
+        problem, x, reference, _ = random_problem(seed, tail_horizon=L)
+        mpc = mampc.MPC(problem)
+        decision = mpc.step(mpc.initial_state(), x, reference)
+        n_p, gamma = problem.prediction_horizon, L / (1 + L)
+        y = predicted(problem.model, x, decision.plan, n_p + 400)
+        cost = cost_of(problem, x, problem.model.u_op, reference, decision.plan)
+        for start, stop in ((1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 390)):
+            weights, piece = gamma ** np.arange(start, stop), slice(n_p + start, n_p + stop)
+            of_mean = distance(problem, weights @ y[None, piece] / weights.sum(), reference)[0] ** 2
+            of_each = weights @ distance(problem, y[piece], reference) ** 2  # as set points count
+            each = np.where(problem.zoned, weights.sum() * of_mean, of_each)
+            cost += each @ np.diag(problem.output_weight)
+        assert decision.objective == pytest.approx(cost, rel=1e-8)
+
+
+def test_inside_its_zone_an_output_costs_nothing_and_moves_nothing():
+    problem = tank_problem(zone_below=1.0, zone_above=1.0, tail_horizon=10.0)
+    model = problem.model
+    for controller in (mampc.MPC(problem), mampc.MAMPC(problem, mampc.MoveRules(price=0.01))):
+        state = controller.initial_state()
+        for seed in range(5):
+            x = 0.5 * np.random.default_rng(seed).standard_normal(model.n_states)
+            x *= 0.9 / np.abs(model.C @ x).max()
+            decision = controller.step(state, x, model.y_op)
+            if (np.abs(predicted(model, x, model.u_op[None], 300) - model.y_op) < 1).all():
+                assert decision.objective == 0.0
+                assert not decision.moves.any()
+
+
+def test_noise_within_a_zone_moves_nothing():
+    problem = tank_problem(zone_below=0.5, zone_above=0.5)
+    regulator = mampc.Regulator(mampc.MPC(problem))
+    run = mampc.simulate(tank_model(), regulator, problem.model.y_op, steps=100, noise=0.1, seed=1)
+    assert run.metrics(threshold=1e-9).moves.sum() == 0
+
+
+def test_one_sided_zones_push_one_way_only():
+    problem = tank_problem(zone_below=0.0, zone_above=INF)
+    mpc, model = mampc.MPC(problem), problem.model
+    above = mpc.step(mpc.initial_state(), np.zeros(model.n_states), model.y_op - 2.0)
+    below = mpc.step(mpc.initial_state(), np.zeros(model.n_states), model.y_op + 2.0)
+    assert not above.moves.any()
+    assert (below.u > model.u_op).any()
+
+
+def test_zones_may_move_at_run_time_also_ahead():
+    problem, x, reference, rng = random_problem(4)
+    mpc, n_p = mampc.MPC(problem), problem.prediction_horizon
+    usual = mpc.step(mpc.initial_state(), x, reference)
+    same = mampc.Zone(reference - problem.zone_below, reference + problem.zone_above)
+    given = mpc.step(mpc.initial_state(), x, same)
+    assert given.objective == usual.objective
+    np.testing.assert_array_equal(given.plan, usual.plan)
+    low = reference + rng.uniform(-1, 0, (n_p + 1, 2))
+    ahead = mampc.Zone(low, low + rng.uniform(0, 1, (n_p + 1, 2)))
+    decision = mpc.step(mpc.initial_state(), x, ahead)
+    cost = cost_of(problem, x, problem.model.u_op, ahead, decision.plan)
+    assert decision.objective == pytest.approx(cost, rel=1e-9)
+    regulator = mampc.Regulator(mpc)
+    assert regulator.step(regulator.initial_state(), problem.model.y_op, same).status is Status.OPTIMAL
+    unknown = mampc.Zone([np.nan, 0.0], [1.0, 0.0])
+    assert mpc.step(mpc.initial_state(), x, unknown).status is Status.HELD_BAD_MEASUREMENT
+
+
+def test_limits_of_a_sample_and_inputs_in_manual_go_with_zones():
+    for seed in range(6):
+        problem, x, reference, _ = random_problem(2 * seed + 1)
+        u = problem.model.u_op
+        for controller in (mampc.MPC(problem), mampc.MAMPC(problem, mampc.MoveRules(price=0.1))):
+            limits = mampc.Limits(u_min=u - 0.3, u_max=u + 0.3)
+            decision = controller.step(
+                controller.initial_state(), x, reference, limits=limits, manual=[True, False]
+            )
+            narrow = replace(
+                problem, limits=replace(problem.limits, u_min=[u[0], u[1] - 0.3], u_max=[u[0], u[1] + 0.3])
+            )
+            other = (
+                mampc.MPC(narrow)
+                if isinstance(controller, mampc.MPC)
+                else mampc.MAMPC(narrow, controller.rules)
+            )
+            expected = other.step(other.initial_state(), x, reference)
+            assert decision.objective == pytest.approx(expected.objective, rel=1e-8)
+            assert not decision.moves[:, 0].any()
+
+
+def test_batches_replays_and_copies_make_the_same_moves():
+    problem = tank_problem(zone_below=0.3, zone_above=[0.3, 0.0])
+    model = problem.model
+    reference = mampc.steps(16, model.y_op, [(5, model.y_op + 2.0)])
+    for controller in (mampc.MPC(problem), mampc.MAMPC(problem, mampc.MoveRules(price=1.0))):
+        regulator = mampc.Regulator(controller)
+        for preview in (False, True):
+            options = {"steps": 16, "noise": 0.1, "preview": preview}
+            batch = mampc.simulate_batch(model, regulator, reference, seeds=range(2), **options)
+            for seed in range(2):
+                run = mampc.simulate(model, regulator, reference, seed=seed, **options)
+                np.testing.assert_allclose(batch.u[seed], run.u, atol=1e-9)
+        state = regulator.initial_state()
+        again = mampc.Regulator(pickle.loads(pickle.dumps(controller)))
+        run = mampc.simulate(model, regulator, reference, steps=16, noise=0.1)
+        assert mampc.replay(again, state, mampc.Recording.of(run), tolerance=0.0) is None
+
+
+@pytest.mark.parametrize(("u", "y"), [(1e-6, 1e3), (1e5, 1e-5), (1e-4, 1e-4)])
+def test_units_decide_nothing(u, y):
+    def decided(u, y, seed):
+        rng = np.random.default_rng(seed)
+        usual = random_model(seed, m=2, l=2)
+        model = mampc.StateSpace(
+            usual.A, usual.B / u, usual.C * y, usual.D * y / u, 1.0, usual.u_op * u, usual.y_op * y
+        )
+        problem = mampc.TrackingProblem(
+            model, prediction_horizon=8, control_horizon=3, output_weight=1 / y**2, move_weight=0.1 / u**2,
+            limits=mampc.Limits(u_min=model.u_op - u, u_max=model.u_op + u), tail_horizon=4.0,
+            zone_below=[0.3 * y, INF], zone_above=0.1 * y,
+        )  # fmt: skip
+        sparse = mampc.MAMPC(problem, mampc.MoveRules(price=0.1))
+        x, reference = rng.standard_normal(3), model.y_op + 2 * y * rng.standard_normal(2)
+        decision = sparse.step(sparse.initial_state(), x, reference)
+        assert decision.status is Status.OPTIMAL
+        return decision.changes / u, decision.objective
+
+    for seed in range(6):
+        for usual, other in zip(decided(1.0, 1.0, seed), decided(u, y, seed), strict=True):
+            np.testing.assert_allclose(other, usual, rtol=1e-6, atol=1e-7)
+
+
+def test_small_move_weights_leave_the_optimum_what_it_is():
+    for seed in range(3):
+        for weight in (1e-4, 1e-7):
+            problem, x, reference, _ = random_problem(seed, move_weight=weight)
+            mpc = mampc.MPC(problem)
+            decision = mpc.step(mpc.initial_state(), x, reference)
+            best = best_on_every_pattern(
+                replace(problem, control_horizon=3), PLAIN, x, problem.model.u_op, reference
+            )[-1]
+            cost = cost_of(problem, x, problem.model.u_op, reference, decision.plan)
+            assert decision.objective == pytest.approx(cost, rel=1e-7, abs=1e-9)
+            assert decision.objective <= best * (1 + 1e-6) + 1e-7
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"zone_below": -1.0}, "zone_below: expected at least 0"),
+        ({"zone_above": [1.0, 2.0, 3.0]}, "zone_above: expected None, a scalar or 2 values"),
+        ({"zone_above": "wide"}, "zone_above: expected real numbers"),
+        (
+            {"zone_above": 1.0, "output_weight": [[1.0, 0.5], [0.5, 1.0]]},
+            "output_weight: expected no products",
+        ),
+    ],
+)
+def test_bad_zones_are_refused_with_what_was_expected(changes, said):
+    with pytest.raises(mampc.MampcError, match=said):
+        tank_problem(**changes)
+
+
+def test_bad_ranges_are_refused_with_what_was_expected():
+    with pytest.raises(mampc.MampcError, match="expected low <= high"):
+        mampc.Zone([1.0, 2.0], [0.0, 3.0])
+    with pytest.raises(mampc.MampcError, match="of the same shape"):
+        mampc.Zone([1.0], [0.0, 3.0])
+    with pytest.raises(mampc.MampcError, match="low: expected numbers"):
+        mampc.Zone("low", "high")
+    mpc = mampc.MPC(tank_problem(zone_below=[1.0, 0.0]))
+    x = np.zeros(mpc.problem.model.n_states)
+    for zone, said in (
+        (mampc.Zone([1.0, 2.0, 3.0], [1.0, 2.0, 3.0]), "expected a Zone of shape"),
+        (mampc.Zone([1.0, 2.0], [2.0, 3.0]), "ranges only of outputs that have a zone"),
+    ):
+        with pytest.raises(mampc.MampcError, match=said):
+            mpc.step(mpc.initial_state(), x, zone)
+    with pytest.raises(mampc.MampcError, match="ranges only of outputs that have a zone"):
+        plain = mampc.MPC(tank_problem())
+        plain.step(plain.initial_state(), x, mampc.Zone([1.0, 2.0], [2.0, 3.0]))
+
+
+def test_what_needs_set_points_says_so():
+    problem = tank_problem(zone_below=1.0)
+    assert np.isinf(mampc.largest_offset(problem, mampc.MoveRules(price=0.1))).all()
+    with pytest.raises(mampc.MampcError, match="expected one with set points"):
+        mampc.rivals.QuietZone(mampc.MPC(problem), band=1.0)
+    with pytest.raises(mampc.MampcError, match="expected set points"):
+        mampc.rivals.Penalised(problem, penalty=mampc.rivals.L1(weight=1.0))
+
+
+def test_a_study_with_zones_needs_fewer_moves():
+    text = template().replace("steps = 145", "steps = 40").replace("prbs_order = 8", "prbs_order = 6")
+    text = text.replace("at = 50", "at = 12").replace("at = 100", "at = 26")
+    assert "# zone_below" in text
+    moves = []
+    for study in (text, text.replace("# zone_below", "zone_below").replace("# zone_above", "zone_above")):
+        study = parse_study(study)
+        outcome = run_study(study.model_copy(update={"controllers": study.controllers[:1]}))
+        moves.append(outcome.runs["noisy"]["MPC"].metrics(threshold=0.1).moves.sum())
+    assert moves[1] < moves[0]
