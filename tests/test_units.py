@@ -81,6 +81,31 @@ def test_units_change_numbers_and_not_decisions(name, u, y):
     np.testing.assert_allclose(other.y / y, usual.y, atol=1e-5)
 
 
+@pytest.mark.parametrize("u", [1e-9, 2e-5, 3e4, 1e9])
+def test_what_a_run_counts_does_not_depend_on_units(u):
+    """Moves, reversals and holds are those of the same run in other units, and so are the starts of its actuators."""
+    model = random_model(4, n=3, m=2, l=2, radius=0.8)
+    counted = []
+    for unit in (1.0, u):
+        outcome = run(
+            model, unit, 1.0, METHODS["exact"], {"output_weight": 1.0, "move_weight": 0.1 / unit**2}
+        )
+        metrics = outcome.metrics(threshold=0.1 * unit, dead_band=0.05 * unit)
+        counted.append(
+            (
+                metrics.moves,
+                metrics.reversals,
+                metrics.median_hold_time,
+                metrics.starts,
+                metrics.sparse_density,
+            )
+        )
+        counted[-1] += (outcome.metrics().starts, metrics.travel / unit)
+    assert 0 < counted[0][0].sum() < 120
+    for usual, other in zip(*counted, strict=True):
+        np.testing.assert_allclose(other, usual, rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize(("u", "y"), [(1e-3, 1e3), (1e-3, 1e5), (1e-4, 1e6), (1.0, 1e8)])
 def test_with_the_default_weights_too_units_far_apart_are_controlled(name, u, y):

@@ -88,6 +88,11 @@ class Controller(ABC):
         """How many past inputs the controller looks back on."""
         return self._memory
 
+    @property
+    def resolution(self) -> Array:
+        """Changes up to here are rounding and no moves, in input units, shape (m,); see `Decision`."""
+        return self._resolution
+
     def with_model(self, model: StateSpace) -> Self:
         """The same controller, predicting with another model of the same signals."""
 

@@ -50,6 +50,7 @@ class Batch:
         decisions: of each loop, as in `Run`; none unless asked for.
         dt: sample time in seconds.
         names: of the inputs and outputs.
+        resolution: of each loop's inputs, as in `Run`, shape (S, m).
     """
 
     t: Array
@@ -65,13 +66,14 @@ class Batch:
     decisions: tuple[tuple[Decision, ...], ...] = field(repr=False)
     dt: float
     names: Names
+    resolution: Array
 
     def __len__(self) -> int:
         return len(self.u)
 
     def __getitem__(self, loop: int) -> Run:
         """One loop as a run."""
-        own = ("u", "y", "y_measured", "r", "u_initial", "v", "position", "faults", "decisions")
+        own = ("u", "y", "y_measured", "r", "u_initial", "v", "position", "faults", "decisions", "resolution")
         shared = ("t", "dt", "names")
         return Run(
             **{name: getattr(self, name)[loop] for name in own},
@@ -192,7 +194,7 @@ def simulate_batch(
         r=np.array([course.reference[:T] for course in courses]), u_initial=records.u_initial,
         v=np.array([course.v for course in courses]), position=records.position, seeds=seeds,
         faults=tuple(records.faults), decisions=tuple(map(tuple, records.decisions)), dt=model.dt,
-        names=plants[0].names,
+        names=plants[0].names, resolution=np.array([own.controller.resolution for own in regulators]),
     )  # fmt: skip
 
 

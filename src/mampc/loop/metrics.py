@@ -65,6 +65,7 @@ def compute(
     skip: int = 0,
     dead_band: Any = 0.0,
     position: Array | None = None,
+    resolution: Any = SAME,
 ) -> Metrics:
     """Metrics of a trajectory.
 
@@ -76,6 +77,7 @@ def compute(
         skip: samples to leave out at the start, 0 <= skip < T.
         dead_band: changes that an actuator does not answer, in input units, one number or one per input.
         position: where the actuators were, shape (T, m), whose starts are counted; default the decided inputs.
+        resolution: changes up to here are rounding and no moves, in input units, as in `Decision`; default 1e-9.
 
     Source: paper, eqs. 10 and 11.
 
@@ -89,11 +91,12 @@ def compute(
         raise MampcError(f"dead_band: expected numbers of at least 0, received {dead_band!r}")
     changes = np.diff(np.vstack([u_initial, u]), axis=0)[skip:]
     size = np.abs(changes)
-    steps, moved = len(size), size > SAME
+    steps, smallest = len(size), as_vector("resolution", resolution, u.shape[1])
+    moved = size > smallest
     moves = moved.sum(axis=0)
     holds = [np.diff(np.concatenate([[0], np.flatnonzero(column), [steps]])) * dt for column in moved.T]
     real = np.vstack([u_initial, u if position is None else position])[skip:]
-    starts = np.array([_starts(column, width) for column, width in zip(real.T, band, strict=True)])
+    starts = np.array([_starts(*actuator) for actuator in zip(real.T, band, smallest, strict=True)])
     return Metrics(
         steps=steps,
         skipped=skip,
@@ -120,10 +123,10 @@ def _reversals(moves: Array) -> int:
     return int(np.count_nonzero(direction[1:] != direction[:-1]))
 
 
-def _starts(course: Array, dead_band: float) -> int:
+def _starts(course: Array, dead_band: float, resolution: float) -> int:
     """How often an actuator has to start that stands at course[0] and follows beyond its dead-band."""
-    moved = np.abs(np.diff(course)) > SAME
-    if dead_band <= SAME:
+    moved = np.abs(np.diff(course)) > resolution
+    if dead_band <= resolution:
         return int(np.count_nonzero(moved))
     starts, stands = 0, float(course[0])
     for wanted in course[1:][moved].tolist():

@@ -14,6 +14,7 @@ from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 from mampc.base.files import written_whole
 from mampc.base.names import Names
+from mampc.base.tolerances import SAME
 from mampc.controllers.decision import Decision
 from mampc.loop import metrics
 from mampc.loop.metrics import Metrics
@@ -40,6 +41,8 @@ class Run:
         position: where the actuators were, shape (T, m): the decided inputs unless there are `Valves`.
         dt: sample time in seconds.
         names: of the inputs and outputs.
+        resolution: changes up to here are rounding and no moves, in input units, shape (m,), as in `Decision`; 1e-9
+            unless the controller says otherwise.
     """
 
     t: Array
@@ -54,8 +57,11 @@ class Run:
     v: Array
     faults: dict[int, tuple[str, ...]]
     position: Array = None  # type: ignore[assignment]  # always set after construction
+    resolution: Array = None  # type: ignore[assignment]  # as above
 
     def __post_init__(self) -> None:
+        if self.resolution is None:
+            object.__setattr__(self, "resolution", np.full(self.u.shape[1], SAME))
         if self.position is None:
             object.__setattr__(self, "position", self.u)
 
@@ -71,6 +77,7 @@ class Run:
         return metrics.compute(
             self.u, self.y, self.r, self.u_initial, self.dt,
             threshold=threshold, skip=skip, dead_band=dead_band, position=self.position,
+            resolution=self.resolution,
         )  # fmt: skip
 
     @property

@@ -216,6 +216,7 @@ def closed_loop(
     return Run(
         t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + course.noise, r=r, u_initial=start,
         decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found, position=positions,
+        resolution=regulator.controller.resolution,
     )  # fmt: skip
 
 
