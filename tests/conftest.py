@@ -9,6 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections import Counter
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from hypothesis import HealthCheck, Phase, settings
 from builders import load_bank
 from mampc.program.daqp import DaqpSolver
 from mampc.program.qp import UNBOUNDED, QPStatus
+from mampc.report import output
+from mampc.report.figures import study_figures
 from seeds import examples
 
 # For tests/test_fuzz.py alone; other tests keep the settings that they state.
@@ -120,3 +123,9 @@ def browser():
     browser = driver.Chrome(options=options, service=driver.ChromeService(chromedriver))
     yield browser
     browser.quit()
+
+
+@pytest.fixture
+def few_figures(monkeypatch):
+    """A run draws the first of its figures, since drawing takes most of its time."""
+    monkeypatch.setattr(output, "study_figures", lambda result: islice(study_figures(result), 1))

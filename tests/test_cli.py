@@ -61,7 +61,7 @@ def test_identify_writes_a_model_and_its_validation(record, tmp_path):
         assert (tmp_path / f"model.{kind}").stat().st_size > 1000
 
 
-def test_new_writes_a_study_once_and_run_runs_it(tmp_path):
+def test_new_writes_a_study_once_and_run_runs_it(tmp_path, few_figures):
     assert call("new", "my-study.toml", cwd=tmp_path).returncode == 0
     study = tmp_path / "my-study.toml"
     assert study.read_text() == template()

@@ -31,7 +31,7 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("ugly_export", None)
 
 
-def test_the_commands_lead_from_the_export_to_a_running_study(folder):
+def test_the_commands_lead_from_the_export_to_a_running_study(folder, few_figures):
     assert len(commands()) >= 3
     for command in commands():
         outcome = CliRunner().invoke(app, command)

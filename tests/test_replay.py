@@ -142,7 +142,7 @@ def test_a_run_that_is_not_there_is_refused_before_anything_is_identified(tmp_pa
 SHORT = template().replace("steps = 145", "steps = 30").replace("skip = 15", "skip = 5")
 
 
-def test_every_trajectory_of_a_study_replays_from_the_command_line(tmp_path):
+def test_every_trajectory_of_a_study_replays_from_the_command_line(tmp_path, few_figures):
     study = tmp_path / "study.toml"
     study.write_text(SHORT)
     run_and_write(parse_study(SHORT), tmp_path / "out")

@@ -253,7 +253,7 @@ def test_a_study_that_does_not_fit_leaves_the_last_results_alone(tmp_path):
     assert (tmp_path / "out" / "summary.json").read_text() == "old"
 
 
-def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
+def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path, few_figures):
     text = SHORT.replace('name = "MPC"', r"name = 'a [/b] $\foo{$'")
     outcome, summary, missing = run_and_write(parse_study(text), tmp_path / "out")
     assert missing == ()
@@ -263,7 +263,7 @@ def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
     assert "a [/b] $" in console.file.getvalue()
 
 
-def test_trajectories_of_names_that_share_words_stay_apart(tmp_path):
+def test_trajectories_of_names_that_share_words_stay_apart(tmp_path, few_figures):
     text = SHORT.replace('name = "noise-free"', 'name = "a"').replace('name = "noisy"', 'name = "a-b"')
     text = text.replace('name = "MPC"', 'name = "c"').replace('name = "MAMPC ns=1"', 'name = "b-c"')
     outcome, *_ = run_and_write(parse_study(text), tmp_path / "out")
