@@ -130,6 +130,20 @@ def move_rules(draw, n_c):
     }
 
 
+def levels(kind, limits):
+    """Levels that fit the limits; None without a kind, and for limits that leave no range."""
+    apart = limits.u_max - limits.u_min
+    if kind is None or not (np.isfinite(apart) & (apart > 0)).all():
+        return None
+    entries = {
+        "step": [0.05 * width for width in apart],
+        "list": [np.linspace(low, high, 4).tolist() for low, high in zip(limits.u_min, limits.u_max, strict=True)],
+        "on/off": [mampc.OnOff(min_on=2.0, min_off=3.0) for _ in apart],
+    }  # fmt: skip
+    entries["mixed"] = [None, *entries["list"][1:]]
+    return entries[kind]
+
+
 @st.composite
 def loops(draw):
     """A regulator: problem, rules and method, estimator and sensor checks."""
@@ -152,7 +166,15 @@ def loops(draw):
         settings["on_limit_violation"] = draw(st.sampled_from(["keep_budget", "ignore_budget"]))
         size, checked = draw(st.sampled_from([0.0, 0.0, 0.05, 0.4])), problem.limits
         most = np.minimum(checked.du_max, checked.u_max - checked.u_min).min()
-        rules = mampc.MoveRules(**draw(move_rules(n_c)), min_size=size if size <= most else 0.0)
+        on_levels = draw(st.sampled_from([None, None, None, "step", "list", "mixed", "on/off"]))
+        told = levels(on_levels, checked)
+        if told is not None:
+            settings["on_limit_violation"] = "keep_budget"
+            if method == "alternating":
+                settings = {"polish": True, "on_limit_violation": "keep_budget"}
+        rules = mampc.MoveRules(
+            **draw(move_rules(n_c)), min_size=size if size <= most else 0.0, levels=told
+        )  # fmt: skip
     with_range = draw(st.booleans())
     sensors = mampc.SensorChecks(
         y_low=model.y_op - 20 * scale if with_range else None,

@@ -8,6 +8,7 @@ import numpy as np
 import pyscipopt
 from scipy import sparse
 
+import mampc
 from builders import cost_of, cost_of_inputs, fading, predicted, violation_scale
 
 TINY = 1e-9  # changes below are rounding
@@ -48,6 +49,27 @@ def keeps_rules(rules, past, moves):
         )
         if any(abs(t - j) < rules.dwell for j in np.flatnonzero(moves[:, a]) for t in times if t != j):
             return False
+    return True
+
+
+def keeps_timings(rules, problem, past, plan):
+    """Whether courses of on/off inputs (nc, m), after the past inputs (h, m), keep their times and starts."""
+    levels = rules.levels if isinstance(rules.levels, tuple) else (rules.levels,) * plan.shape[1]
+    dt, course, first = problem.model.dt, np.vstack([past, plan]), len(past)
+    for a, entry in enumerate(levels):
+        if not isinstance(entry, mampc.OnOff):
+            continue
+        on = problem.limits.u_max[a] if entry.on is None else entry.on
+        is_on = course[:, a] == on
+        switched = np.flatnonzero(is_on[1:] != is_on[:-1]) + 1
+        for before, now in zip([None, *switched], switched, strict=False):
+            least = entry.min_off if is_on[now] else entry.min_on
+            if now >= first and before is not None and (now - before) * dt < least:
+                return False
+            starts = [t for t in switched if is_on[t] and 0 <= (now - t) * dt < 3600.0]
+            most = entry.starts_per_hour
+            if now >= first and is_on[now] and most is not None and len(starts) > most:
+                return False
     return True
 
 
@@ -240,5 +262,43 @@ def scip_bounds(problem, rules, x, u_previous, reference, seconds):
     scip.addCons(pyscipopt.quicksum(0.5 * root * root for root in roots) <= curved)
     linear = pyscipopt.quicksum(program.f[i] * z[i] for i in range(l + n))
     scip.setObjective(curved + linear + rules.price * pyscipopt.quicksum(counted_))
+    scip.optimize()
+    return program.constant + scip.getDualbound(), program.constant + scip.getObjVal()
+
+
+def scip_on_levels(problem, rules, levels, x, u_previous, reference, seconds):
+    """Lower and upper bound of the optimum of one input on levels, by SCIP with a binary for each level."""
+    n_c, l = problem.control_horizon, problem.model.n_outputs
+    program = program_of(problem, x, np.asarray(u_previous), reference)
+    scip = pyscipopt.Model()
+    scip.hideOutput()
+    for name, value in {"limits/time": seconds, "timing/clocktype": 1, "limits/gap": 0.0}.items():
+        scip.setParam(name, value)
+    z = [scip.addVar(lb=None) for _ in range(l + n_c)]
+    at = [[scip.addVar(vtype="B") for _ in levels] for _ in range(n_c)]
+    on = [scip.addVar(vtype="B") for _ in range(n_c)]
+    most = max(levels) - min(levels)
+    for row, bound in zip(program.rows, program.bounds, strict=True):
+        scip.addCons(pyscipopt.quicksum(row[i] * z[i] for i in np.flatnonzero(row)) <= bound)
+    u = [
+        float(u_previous[0]),
+        *(pyscipopt.quicksum(v * b for v, b in zip(levels, row, strict=True)) for row in at),
+    ]
+    for j in range(n_c):
+        scip.addCons(pyscipopt.quicksum(at[j]) == 1)
+        scip.addCons(z[l + j] == u[j + 1] - u[j])
+        scip.addCons(z[l + j] <= most * on[j])
+        scip.addCons(-z[l + j] <= most * on[j])
+    if rules.max_moves is not None:
+        scip.addCons(pyscipopt.quicksum(on) <= rules.max_moves)
+    for first in range(n_c - rules.dwell + 1):
+        if rules.dwell > 1:
+            scip.addCons(pyscipopt.quicksum(on[first : first + rules.dwell]) <= 1)
+    curved, roots = scip.addVar(lb=None), [scip.addVar(lb=None) for _ in z]
+    for column, root in zip(np.linalg.cholesky(program.H).T, roots, strict=True):
+        scip.addCons(pyscipopt.quicksum(column[i] * z[i] for i in np.flatnonzero(column)) == root)
+    scip.addCons(pyscipopt.quicksum(0.5 * root * root for root in roots) <= curved)
+    linear = pyscipopt.quicksum(program.f[i] * z[i] for i in range(l + n_c))
+    scip.setObjective(curved + linear + rules.price * pyscipopt.quicksum(on))
     scip.optimize()
     return program.constant + scip.getDualbound(), program.constant + scip.getObjVal()

@@ -55,3 +55,18 @@ def test_levels_that_may_float_need_fewer_moves():
     (mpc, price), (mpc_at_points, price_at_points) = moves
     assert mpc < 0.6 * mpc_at_points
     assert price < 0.8 * price_at_points
+
+
+def test_an_on_off_heater_keeps_its_times_and_starts(found):
+    runs = found("on-off")["noisy"]
+    u = runs["six starts an hour"].u[:, 0]
+    switched = np.flatnonzero(np.diff(u) != 0) + 1
+    is_on = u[switched] == 1.0
+    assert (np.diff(switched)[is_on[:-1]] >= 3).all()
+    assert (np.diff(switched)[~is_on[:-1]] >= 2).all()
+    starts = switched[is_on]
+    assert all(((starts > t - 60) & (starts <= t)).sum() <= 6 for t in starts)
+    for name in ("on/off", "on/off with times", "six starts an hour"):
+        assert set(runs[name].u.ravel().tolist()) == {0.0, 1.0}
+        assert runs[name].y[80:120].mean() == pytest.approx(22.0, abs=0.5)
+    assert set(runs["quarters"].u.ravel().tolist()) <= {0.0, 0.25, 0.5, 0.75, 1.0}

@@ -42,6 +42,12 @@ class Ranges:
         self.du_max = np.clip(rows("du_max", usual.du_max), 0.0, usual.du_max)[0]
 
 
+def on_level(at, low, high, values):
+    """The nearest value within limits, on the nearest level where some is within them."""
+    within = [] if values is None else [value for value in values if low <= value <= high]
+    return min(within, key=lambda value: abs(value - at)) if within else np.clip(at, low, high)
+
+
 def read(values):
     """The numbers told, not-a-number where they are missing or masked."""
     return np.ma.filled(np.ma.array(values, dtype=float), np.nan)
@@ -223,7 +229,12 @@ class FaultyLoop(RuleBasedStateMachine):
         assert np.isfinite(decision.plan).all()
         assert np.isfinite(decision.changes).all()
         by_hand = np.zeros(len(u), dtype=bool) if self.manual is None else np.array(self.manual)
-        left_alone = by_hand & ((last < ranges.low) | (last > ranges.high)).any(axis=0)
+        levels = self.regulator.controller.levels
+        values = [None] * len(u) if levels is None else levels.values
+        off = np.array(
+            [known is not None and at not in known for at, known in zip(last, values, strict=True)]
+        )
+        left_alone = by_hand & (((last < ranges.low) | (last > ranges.high)).any(axis=0) | off)
         np.testing.assert_array_equal(decision.plan[0][~left_alone], u[~left_alone])
         assert (decision.plan >= ranges.low)[:, ~left_alone].all()
         assert (decision.plan <= ranges.high)[:, ~left_alone].all()
@@ -233,8 +244,11 @@ class FaultyLoop(RuleBasedStateMachine):
         assert (apart <= 1e-9 + 1e-14 * sizes).all()
         assert (ranges.low[0] <= u).all()
         assert (u <= ranges.high[0]).all()
-        inside_now = np.clip(last, ranges.low[0], ranges.high[0])
-        inside = (last >= ranges.low[0]) & (last <= ranges.high[0])
+        inside_now = np.array(list(map(on_level, last, ranges.low[0], ranges.high[0], values)))
+        for at, low, high, known in zip(u, ranges.low[0], ranges.high[0], values, strict=True):
+            if known is not None and ((known >= low) & (known <= high)).any():
+                assert at in known
+        inside = (last >= ranges.low[0]) & (last <= ranges.high[0]) & ~off
         rounding = 1e-9 + 4 * np.spacing(np.abs(last))
         assert (np.abs(u - last) <= ranges.du_max + rounding)[inside].all()
         if (np.abs(u - last) > ranges.du_max + rounding)[~by_hand].any():

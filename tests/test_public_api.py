@@ -32,7 +32,8 @@ def calls(v):
     for k in (*HORIZONS, "output_weight", "move_weight", "limits", "tail_horizon", "output_limit_weight"):
         yield f"TrackingProblem {k}", lambda k=k: mampc.TrackingProblem(MODEL, **(HORIZONS | {k: v}))
     for k in (
-        "max_moves", "sparsity_horizon", "price", "counting", "min_size", "dwell", "max_moves_per_step", "blocks"
+        "max_moves", "sparsity_horizon", "price", "counting", "min_size", "dwell", "max_moves_per_step", "blocks",
+        "levels",
     ):  # fmt: skip
         yield f"MoveRules {k}", lambda k=k: mampc.MAMPC(PROBLEM, mampc.MoveRules(**{k: v}))
     for k in ("u_min", "u_max", "du_max", "y_min", "y_max"):
@@ -48,6 +49,8 @@ def calls(v):
     yield "Regulator filter", lambda: mampc.Regulator(MPC, reference_filter=v)
     for k in ("time_constant", "rate"):
         yield f"ReferenceFilter {k}", lambda k=k: mampc.ReferenceFilter(**{k: v})
+    for k in ("off", "on", "min_on", "min_off", "starts_per_hour"):
+        yield f"OnOff {k}", lambda k=k: mampc.MAMPC(PROBLEM, mampc.MoveRules(levels=mampc.OnOff(**{k: v})))
     yield "n4sid", lambda: mampc.n4sid(v)
     yield "n4sid order", lambda: mampc.n4sid(DATA, order=v)
     yield "n4sid records", lambda: mampc.n4sid([DATA, v])

@@ -50,6 +50,7 @@ from mampc.methods import (
     ReweightedL1,
 )
 from mampc.moves.rules import MoveRules
+from mampc.program.levels import OnOff
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.zone import Zone
 from mampc.systems.linearisation import linearise
@@ -91,6 +92,7 @@ __all__ = [
     "MoveRules",
     "Names",
     "Noise",
+    "OnOff",
     "PenaltyDecomposition",
     "PlannedTest",
     "Recording",

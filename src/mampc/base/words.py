@@ -53,7 +53,10 @@ class Remark(Sentence):
         "budget_exceeded",
         "The moves already made exceed the budget of their window: no further move is planned.",
     )
-    BACK_INSIDE = "back_inside", "The applied inputs were outside their limits and go back inside."
+    BACK_INSIDE = (
+        "back_inside",
+        "The applied inputs were outside their limits, or off their levels, and go back.",
+    )
     ROUNDING = (
         "rounding",
         "The prediction enlarges rounding so much that the optimum is known no better than to within the gap.",

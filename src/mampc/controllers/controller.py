@@ -21,6 +21,7 @@ from mampc.moves.pattern_solver import PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.daqp import active_bounds
+from mampc.program.levels import InputLevels
 from mampc.program.limits_now import InputRange, LimitsNow, UsualLimits
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.sample import Indices, Sample
@@ -39,6 +40,7 @@ class Controller(ABC):
         problem: what to track, over which horizons, at what weights and within what limits.
         time_limit: seconds that a sample may take, up to which an answer has to be there; None for no limit.
         condensed: the condensed problem, where another controller has it already.
+        levels: what inputs can be, see `MoveRules`.
     """
 
     _made_of: tuple[tuple[Any, ...], dict[str, Any]]
@@ -56,6 +58,7 @@ class Controller(ABC):
         time_limit: float | None = None,
         bound_every_move: bool = False,
         condensed: CondensedQP | None = None,
+        levels: Any = None,
     ) -> None:
         if not isinstance(problem, TrackingProblem):
             raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
@@ -67,7 +70,8 @@ class Controller(ABC):
         self.condensed = condensed
         self._while_frozen: PatternSolver | None = None  # plain MPC while some inputs may not move
         limits, model = problem.limits, problem.model
-        self._usual_limits = UsualLimits(self.condensed)
+        self.levels = None if levels is None else InputLevels(levels, problem)
+        self._usual_limits = UsualLimits(self.condensed, self.levels)
         self._some_unlimited = bool(np.isinf([limits.u_min, limits.u_max]).any())
         self._du_max = limits.du_max if np.isfinite(limits.du_max).any() else None
         self._resolution = SAME * self.condensed.input_prefix
@@ -167,7 +171,7 @@ class Controller(ABC):
         else:
             depth = reference.ndim if isinstance(reference, np.ndarray) else _dimensions(reference)
             reference = as_shaped("reference", reference, constant if depth == 1 else previewed)
-        limits_now = self._usual_limits if limits is None else LimitsNow(limits, self.condensed)
+        limits_now = self._usual_limits if limits is None else LimitsNow(limits, self.condensed, self.levels)
         applied, frozen = state.inputs[-1], None
         in_manual = self.manual_inputs(manual)
         if in_manual is not None:
@@ -213,7 +217,7 @@ class Controller(ABC):
 
     def _may_leave(self, limits: UsualLimits | LimitsNow) -> bool:
         """Whether an optimum that keeps the limits of the program may leave the range of the inputs all the same."""
-        return self._some_unlimited or limits is not self._usual_limits
+        return self._some_unlimited or limits is not self._usual_limits or self.levels is not None
 
     def _plan_from(self, state: ControllerState, sample: Sample, limits: UsualLimits | LimitsNow) -> Plan:
         """The plan for a sample, with the way back of inputs that are outside their limits."""

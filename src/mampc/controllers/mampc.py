@@ -58,7 +58,8 @@ class MAMPC(Controller):
     ) -> None:
         if not isinstance(rules, MoveRules):
             raise MampcError(f"rules: expected mampc.MoveRules, received {type(rules).__name__}")
-        super().__init__(problem, bound_every_move=bool(np.any(rules.min_size)))
+        every = bool(np.any(rules.min_size)) or rules.levels is not None
+        super().__init__(problem, bound_every_move=every, levels=rules.levels)
         if on_limit_violation not in ON_LIMIT_VIOLATION:
             raise MampcError(
                 f"on_limit_violation: expected one of {', '.join(ON_LIMIT_VIOLATION)}, "
@@ -70,7 +71,13 @@ class MAMPC(Controller):
                 f"violation_margin: expected values of at least 0, received {violation_margin!r}"
             )
         self._margin = margin if on_limit_violation == "ignore_budget" else None
-        self.rules, self._memory = rules, rules.memory
+        if self._margin is not None and self.levels is not None:
+            raise MampcError(
+                "on_limit_violation: expected 'keep_budget' with levels, which plain MPC does not keep, received "
+                f"{on_limit_violation!r}"
+            )
+        self.rules = rules
+        self._memory = max(rules.memory, 1 if self.levels is None else self.levels.memory)
         self.method = method_of(method, settings)
         self._admissible = AdmissiblePatterns(
             rules, problem.model.n_inputs, problem.control_horizon, self.condensed.input_prefix
@@ -95,8 +102,13 @@ class MAMPC(Controller):
         """This controller with plans that count on later data; `shifts` as `Information` takes them.
 
         Raises:
-            MampcError: prices that follow the noise with another search than the exact one by a table.
+            MampcError: inputs on levels, since what later data are worth is known for moves of any size; prices that
+                follow the noise with another search than the exact one by a table.
         """
+        if self.levels is not None:
+            raise MampcError(
+                "value_of_information: expected inputs that take any value, received rules with levels"
+            )
         by_table = isinstance(self._search, ExactSearch) and self._search.has_table
         if price_follows_noise and not by_table:
             raise MampcError(

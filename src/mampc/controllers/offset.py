@@ -38,7 +38,11 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     all_at_once = np.zeros(admissible.n_moves, dtype=bool)
     all_at_once[:m] = True
     unmoved = admissible.allowance(np.zeros((rules.memory, m)))
-    promised = admissible.allows(all_at_once, unmoved) and not admissible.sized and rules.blocks is None
+    promised = (
+        admissible.allows(all_at_once, unmoved)
+        and not (admissible.sized or admissible.on_levels)
+        and rules.blocks is None
+    )
     stable = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0) < 1 - 1e-9
     if not promised or not stable or m < l or problem.prices_inputs or problem.zoned.any():
         return nothing

@@ -287,7 +287,7 @@ def _plans_of(controller: Controller, preview: bool, like: BatchedPlans | None) 
     )
     if admissible.unrestricted:
         return BatchedPlans(controller, preview)
-    if admissible.sized:
+    if admissible.sized or admissible.on_levels:
         return None
     n = controller.condensed.n_moves
     patterns = admissible.listed(LARGEST_TABLE // (n * (n + 1) // 2))

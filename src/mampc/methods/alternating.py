@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_flag, as_number, as_whole
+from mampc.base.errors import MampcError
 from mampc.base.words import Status
 from mampc.methods.heuristic import Ended, Heuristic, HeuristicSearch, proposing
 from mampc.methods.method import Plan
@@ -74,6 +75,13 @@ class AlternatingSearch(HeuristicSearch):
         super().__init__(settings, condensed, rules)
         self.settings, self._polish = settings, settings.polish or settings.certify
         self.warm_up = rules.sparsity_horizon if settings.warm_up is None else settings.warm_up
+        if rules.levels is not None:
+            if not self._polish or settings.warm_up:
+                raise MampcError(
+                    "alternating: expected polish=True and no warm_up with levels, which plain MPC and small moves "
+                    f"do not keep, received polish={settings.polish} and warm_up={settings.warm_up}"
+                )
+            self.warm_up = 0
         self._first_step = FirstStep(condensed, settings.penalty)
         self._threshold = None
         if self.admissible.simple and rules.max_moves is not None and not self.admissible.priced:

@@ -104,14 +104,14 @@ class HeuristicSearch:
         status: Status = Status.FEASIBLE,
     ) -> Plan:
         """The best plan on the patterns proposed, as an answer; no moves at all is always among them."""
-        best, solved = Incumbent(), None
+        best, solved, solver = Incumbent(), None, self._solver.after(inputs)
         try:
             while True:
                 pattern = next(proposals) if solved is None else proposals.send(solved)
-                solved = self._solver.offer(sample, pattern, best)
+                solved = solver.offer(sample, pattern, best)
         except StopIteration as end:
             ended: Ended = end.value
-        best.offer(self._solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
+        best.offer(solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
         guess, remarks = self._shifted(ended.moves), self._remarks(allowance)
         if best.moves is not None:
             plan = Plan(

@@ -40,7 +40,8 @@ class AdmissiblePatterns:
         candidates: moves that some admissible pattern holds, shape (n_moves,).
         price: of each input, shape (m,); with simultaneous counting the price of a sample.
         min_size: of each move, shape (n_moves,).
-        sized: whether any min_size is above zero.
+        sized: whether any min_size is above zero, and no input has levels, which say more.
+        on_levels: whether some input has levels.
         simple: whether moves compete for the budget alone, one for one.
     """
 
@@ -54,7 +55,8 @@ class AdmissiblePatterns:
         self.price = as_vector("price", rules.price, m)
         self.priced = bool(self.price.any())
         self.min_size: Array = np.tile(as_vector("min_size", rules.min_size, m), n_c)
-        self.sized = bool(self.min_size.any())
+        self.on_levels = rules.levels is not None
+        self.sized = bool(self.min_size.any()) and not self.on_levels
         self.per_step = m if rules.max_moves_per_step is None else min(m, rules.max_moves_per_step)
         starts = np.ones(n_c, dtype=bool)
         if rules.blocks is not None:
@@ -72,10 +74,16 @@ class AdmissiblePatterns:
         self._same = SAME * input_prefix
 
     @property
+    def nested(self) -> bool:
+        """Whether one move more never costs anything: only patterns that spend the whole budget are of interest."""
+        return self.simple and not self.priced and not self.sized
+
+    @property
     def unrestricted(self) -> bool:
         """Whether there are no rules at all: every pattern is admissible, at no price and with moves of any size."""
         free = self.rules.max_moves is None and self.rules.dwell == 1 and self.per_step == self.n_inputs
-        return free and bool(self.candidates.all()) and not self.priced and not self.sized
+        free &= bool(self.candidates.all()) and not self.priced
+        return free and not self.sized and not self.on_levels
 
     def allowance(self, inputs: Array, frozen: Any = None) -> Allowance:
         """What the applied inputs, shape (h, m) with the latest last, allow.
@@ -164,17 +172,19 @@ class AdmissiblePatterns:
             builder.pattern &= np.repeat(got > threshold, m)
         return builder.pattern
 
-    def listed(self, most: int) -> BoolArray | None:
-        """All patterns admissible in steady state, shape (K, n_moves); None if there are more than `most`."""
+    def listed(self, most: int, among: BoolArray | None = None) -> BoolArray | None:
+        """All patterns admissible in steady state, shape (K, n_moves); None if there are more than `most`.
+
+        `among`: the moves that they may hold, shape (n_moves,); None for all.
+        """
+        candidates = self.candidates if among is None else self.candidates & among
         found: list[list[int]] = []
         allowance = Allowance(
             self._most if self.rules.max_moves is None else min(self.rules.max_moves, self._most),
             self._all_free,
             False,
         )
-        for chosen in self._grown(
-            [], np.flatnonzero(self.candidates).tolist(), PatternBuilder(self, allowance)
-        ):
+        for chosen in self._grown([], np.flatnonzero(candidates).tolist(), PatternBuilder(self, allowance)):
             found.append(chosen)
             if len(found) > most:
                 return None

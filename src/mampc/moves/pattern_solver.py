@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from copy import copy
 from time import perf_counter
 from typing import NamedTuple
 
@@ -10,15 +11,18 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.base.tolerances import ROUNDING, SMALLER
-from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.admissible import AdmissiblePatterns, Allowance
+from mampc.moves.level_search import Completion, Found, LevelSearch, Past
 from mampc.moves.rounding import without_rounding
 from mampc.moves.signs import search_signs
 from mampc.program.condensing import CondensedQP
+from mampc.program.levels import InputLevels
 from mampc.program.qp import QPStatus
 from mampc.program.restriction import Restriction
-from mampc.program.sample import Sample
+from mampc.program.sample import LeastSquares, Sample
 
 CACHE_BYTES = 64e6  # for recent patterns and their solvers
+NODES = 200  # of a search over levels, that take about as long as a program
 
 
 class OnPattern(NamedTuple):
@@ -79,6 +83,83 @@ class PatternSolver:
         self._most_programs = most_programs
         self._kept: OrderedDict[bytes, Restriction] = OrderedDict()
         self._kept_bytes = 0
+        self._levels: LevelSearch | None = None
+        self._past: Past | None = None
+        if admissible.on_levels:
+            levels = InputLevels(admissible.rules.levels, condensed.problem)
+            self._levels = LevelSearch(condensed, admissible, levels)
+            self._past = self._levels.past(condensed.problem.model.u_op[None])
+            self._all_free = Allowance(admissible.n_moves, (0,) * admissible.n_inputs, False)
+
+    def after(self, inputs: Array) -> PatternSolver:
+        """The solver after the applied inputs, shape (h, m), on which what inputs on levels may do depends."""
+        if self._levels is None:
+            return self
+        after = copy(self)
+        after._past = self._levels.past(inputs)
+        return after
+
+    @property
+    def free(self) -> BoolArray | None:
+        """The moves of inputs without levels, shape (n_moves,), where others have some; else None."""
+        return None if self._levels is None else ~self._levels.on_levels
+
+    def best_course(
+        self,
+        sample: Sample,
+        allowance: Allowance,
+        free: BoolArray,
+        limits: LeastSquares | None = None,
+        cutoff: float = np.inf,
+        deadline: float = np.inf,
+    ) -> Found:
+        """The best course of the inputs on levels with the moves `free`, shape (n_moves,), of the others.
+
+        `limits`: the problem with limits priced in, if they are active.
+        """
+        assert self._levels is not None
+        assert self._past is not None
+        pattern = self._levels.on_levels & self.admissible.open(allowance) | free
+        completed = None
+        if free.any():
+            restriction = self._restriction(pattern)
+            optimum, bounds = restriction.optimum(sample.target), self._bounds(sample, pattern)
+            if bounds is None:
+                return Found(None, np.inf, np.inf, True, 0)
+            completed = self._completion(sample, pattern, optimum, bounds)
+        return self._levels.search(
+            sample, pattern, allowance, self._past, priced=limits, completed=completed, cutoff=cutoff,
+            deadline=deadline,
+        )  # fmt: skip
+
+    def _completion(
+        self, sample: Sample, pattern: BoolArray, optimum: Array, bounds: tuple[Array, Array]
+    ) -> Completion:
+        """What finds the moves of inputs without levels; bounds are those of the program on the pattern."""
+        assert self._levels is not None
+        restriction, of = self._restriction(pattern), self._levels.factor(pattern)
+        is_free = np.isin(restriction.moves, of.free)
+        own, kept = restriction.n_violations + np.flatnonzero(~is_free), restriction.bounds
+
+        def completed(moves: Array) -> tuple[Array, float] | None:
+            lower, upper = bounds[0][kept], bounds[1][kept]
+            lower[own] = upper[own] = moves[of.moves]
+            nearest = restriction.solve(optimum, lower, upper)
+            if nearest.moves is None:
+                return None
+            moves[of.free] = nearest.moves[is_free]
+            moves = without_rounding(self.condensed, sample, moves)
+            return moves, self.condensed.cost(sample, moves) + self.admissible.charge(moves != 0)
+
+        return completed
+
+    def priced(self, sample: Sample, multipliers: Array | None) -> LeastSquares | None:
+        """The problem with limits priced in by multipliers, shape (n_bounds,), if any is not zero."""
+        return (
+            None
+            if multipliers is None or not multipliers.any()
+            else self.condensed.priced(sample, multipliers)
+        )
 
     def solve(
         self,
@@ -111,6 +192,8 @@ class PatternSolver:
             failed = nearest.moves is None and nearest.status not in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA)
             bound = -np.inf if failed else base + nearest.excess
             return OnPattern(None, bound, nearest.status, nearest.multipliers, nearest.iterations)
+        if self._levels is not None:
+            return self._on_levels(sample, pattern, optimum, bounds, nearest.multipliers, cutoff, deadline)
         if sizes is None or (nearest.moves is optimum and (np.abs(optimum) >= sizes).all()):
             return self._answer(
                 sample, pattern, nearest.moves, base + nearest.excess, cutoff, nearest.multipliers,
@@ -134,6 +217,31 @@ class PatternSolver:
             signed.iterations,
         )
         return answer._replace(status=signed.status)
+
+    def _on_levels(
+        self,
+        sample: Sample,
+        pattern: BoolArray,
+        optimum: Array,
+        bounds: tuple[Array, Array],
+        multipliers: Array | None,
+        cutoff: float,
+        deadline: float,
+    ) -> OnPattern:
+        """The best moves on a pattern that lead from level to level; those that stay cost nothing."""
+        assert self._levels is not None
+        assert self._past is not None
+        mixed = len(self._levels.factor(pattern).free) > 0
+        found = self._levels.search(
+            sample, pattern, self._all_free, self._past, priced=self.priced(sample, multipliers),
+            completed=self._completion(sample, pattern, optimum, bounds) if mixed else None, cutoff=cutoff,
+            deadline=deadline, most=NODES * self._most_programs,
+        )  # fmt: skip
+        status = QPStatus.OPTIMAL if found.complete else QPStatus.TIME_LIMIT
+        if found.moves is None and found.complete and cutoff == np.inf:
+            status = QPStatus.INFEASIBLE
+        objective = found.bound if found.moves is None else found.objective
+        return OnPattern(found.moves, objective, status, multipliers, found.visited)
 
     def _bounds(self, sample: Sample, pattern: BoolArray) -> tuple[Array, Array] | None:
         """The bounds that hold on a pattern; None where it cannot keep them."""

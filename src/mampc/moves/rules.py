@@ -9,6 +9,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_array, as_whole, require_finite
 from mampc.base.errors import MampcError
+from mampc.program.levels import as_levels
 
 COUNTINGS = ("elementwise", "simultaneous")
 
@@ -33,6 +34,8 @@ class MoveRules:
         blocks: a fixed blocking pattern, lengths in samples: moves are allowed only at the first sample of
             each block of the control horizon, such as (1, 2, 2): at j = 0, 1 and 3. The sum is at most nc;
             after the last block the inputs stay.
+        levels: what inputs can be. A step (inputs are multiples of it), a `mampc.OnOff`, or one entry per input, each
+            a step, a list of levels, an OnOff, or None for an input that takes any value: levels=[[0, 40, 100], 0.5].
 
     Raises:
         MampcError: values out of range.
@@ -46,6 +49,7 @@ class MoveRules:
     dwell: int = 1
     max_moves_per_step: int | None = None
     blocks: tuple[int, ...] | None = None
+    levels: Any = None
 
     def __post_init__(self) -> None:
         if self.max_moves is not None:
@@ -72,6 +76,7 @@ class MoveRules:
             object.__setattr__(self, "blocks", tuple(as_whole("blocks", length, 1) for length in lengths))
             if not self.blocks:
                 raise MampcError("blocks: expected at least one block, received none")
+        object.__setattr__(self, "levels", as_levels(self.levels))
 
     def __repr__(self) -> str:
         """Only what is not the default."""

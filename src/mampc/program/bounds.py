@@ -138,6 +138,13 @@ class Bounds:
         self.lower[self.below_rows, one] += (limits.y_min - y_op)[self.below % l, None]
         self.upper[self.below_rows, one] = UNBOUNDED
 
+    def output_rows(self) -> tuple[Array, Indices, Array]:
+        """Limited outputs per move, those below turned over, their outputs, and their rho of `TrackingProblem`."""
+        rows = np.vstack([self._theta_above, -self._theta_below])
+        l = len(self.violation_scale)
+        outputs = np.concatenate([self.above % l, self.below % l])
+        return rows, outputs, np.concatenate([self._fading_above, self._fading_below])
+
     def excess(self, moves: Array, lower: Array, upper: Array, *, faded: bool = False) -> Array:
         """Largest predicted excess over its limits of each output over i = 1..np, shape (l,).
 

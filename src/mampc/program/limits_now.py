@@ -9,6 +9,7 @@ import numpy as np
 from mampc.base.checks import LARGEST, Array, BoolArray, as_read
 from mampc.base.errors import MampcError
 from mampc.program.condensing import CondensedQP
+from mampc.program.levels import InputLevels
 from mampc.program.problem import Limits
 from mampc.program.qp import UNBOUNDED
 from mampc.program.sample import BoundsNow, Sample
@@ -22,10 +23,13 @@ class InputRange:
     Args:
         low, high: what inputs to apply are kept within, shape (nc, m).
         left_alone: the inputs that plans leave beyond it, bool, shape (m,); None for none.
+        levels: on which inputs are to be, if any; of them the range is those within `low` and `high`.
     """
 
-    def __init__(self, low: Array, high: Array, left_alone: BoolArray | None = None) -> None:
-        self._low, self._high, self._left_alone = low, high, left_alone
+    def __init__(
+        self, low: Array, high: Array, left_alone: BoolArray | None = None, levels: InputLevels | None = None
+    ) -> None:
+        self._low, self._high, self._left_alone, self._levels = low, high, left_alone, levels
         if left_alone is not None:
             low, high = np.where(left_alone, -LARGEST, low), np.where(left_alone, LARGEST, high)
         self.low, self.high = low, high
@@ -33,39 +37,57 @@ class InputRange:
 
     def holds(self, u: Array) -> bool:
         """Whether inputs u, shape (m,), are within the range of the first sample, those left alone aside."""
-        for value, (low, high) in zip(u.tolist(), self._first, strict=True):  # noqa: SIM110 - twice as fast
+        for value, (low, high) in zip(u.tolist(), self._first, strict=True):
             if not low <= value <= high:
                 return False
-        return True
+        return self._levels is None or not self._off_levels(u).any()
+
+    def _off_levels(self, u: Array) -> BoolArray:
+        """Which inputs u, shape (m,), that are not left alone are not on their levels."""
+        assert self._levels is not None
+        off = self._levels.missed(u)
+        return off if self._left_alone is None else off & ~self._left_alone
+
+    def _within(self, u: Array, low: Array, high: Array) -> Array:
+        """What is nearest to inputs within limits, all of shape (..., m)."""
+        nearest: Array = np.minimum(np.maximum(u, low), high)
+        if self._levels is None:
+            return nearest
+        levels = self._levels.nearest(u, low, high)
+        return levels if self._left_alone is None else np.where(self._left_alone, nearest, levels)
 
     def nearest(self, u: Array) -> Array:
         """The inputs within the range of the first sample nearest to u, shape (m,); those left alone stay."""
-        return np.asarray(np.minimum(np.maximum(u, self.low[0]), self.high[0]))
+        return self._within(u, self.low[0], self.high[0])
 
     def held(self, u: Array) -> Array:
         """Inputs, shape (nc, m), that stay at u, shape (m,), but where the range makes them move."""
         rows = []
         for low, high in zip(self.low, self.high, strict=True):
-            u = np.minimum(np.maximum(u, low), high)
+            u = self._within(u, low, high)
             rows.append(u)
         return np.array(rows)
 
     def clipped(self, plan: Array) -> Array:
         """Planned inputs, shape (nc, m), brought within the range; those left alone stay."""
-        return np.minimum(np.maximum(plan, self.low), self.high)
+        return self._within(plan, self.low, self.high)
 
     def applied(self, plan: Array) -> Array:
         """The inputs to apply, shape (m,): the first planned ones, and within the range every one of them."""
         u: Array = plan[0]
         if self._left_alone is not None:
             u = np.minimum(np.maximum(u, self._low[0]), self._high[0])
+            if self._levels is not None:
+                u = self._levels.nearest(u, self._low[0], self._high[0])
             u.setflags(write=False)
         return u
 
     def leaving(self, manual: BoolArray, u: Array) -> InputRange:
         """The same range, with inputs in manual, shape (m,), left where u, shape (m,), is beyond it at some sample."""
         beyond = manual & ((u < self._low) | (u > self._high)).any(axis=0)
-        return InputRange(self._low, self._high, manual) if beyond.any() else self
+        if self._levels is not None:
+            beyond |= manual & self._levels.missed(u)
+        return InputRange(self._low, self._high, manual, self._levels) if beyond.any() else self
 
 
 class UsualLimits:
@@ -78,12 +100,13 @@ class UsualLimits:
 
     crossed = False
 
-    def __init__(self, condensed: CondensedQP) -> None:
+    def __init__(self, condensed: CondensedQP, levels: InputLevels | None = None) -> None:
         limits, shape = condensed.problem.limits, (condensed.problem.control_horizon, 1)
-        self._condensed = condensed
+        self._condensed, self._levels = condensed, levels
         self.inputs = InputRange(
             np.tile(np.maximum(limits.u_min, -LARGEST / 2), shape),
             np.tile(np.minimum(limits.u_max, LARGEST / 2), shape),
+            levels=levels,
         )
 
     def applied_to(self, sample: Sample) -> Sample:
@@ -94,7 +117,7 @@ class UsualLimits:
         """The limits with inputs in manual, shape (m,), left alone where u, shape (m,), is beyond them."""
         if self.inputs.leaving(manual, u) is self.inputs:
             return self
-        return LimitsNow(Limits(), self._condensed).with_manual(manual, u)
+        return LimitsNow(Limits(), self._condensed, self._levels).with_manual(manual, u)
 
 
 class LimitsNow:
@@ -113,7 +136,7 @@ class LimitsNow:
         MampcError: the wrong shape, or limits of signals for which the problem has none.
     """
 
-    def __init__(self, limits: Limits, condensed: CondensedQP) -> None:
+    def __init__(self, limits: Limits, condensed: CondensedQP, levels: InputLevels | None = None) -> None:
         problem, usual = condensed.problem, condensed.problem.limits
         n_c, n_p = problem.control_horizon, problem.prediction_horizon
         known = _known(condensed)
@@ -131,7 +154,9 @@ class LimitsNow:
         u_min = np.maximum(given("u_min", n_c), np.maximum(usual.u_min, -LARGEST / 2))
         u_max = np.minimum(given("u_max", n_c), np.minimum(usual.u_max, LARGEST / 2))
         self.crossed = bool((u_min > u_max).any())
-        self.inputs = UsualLimits(condensed).inputs if self.crossed else InputRange(u_min, u_max)
+        self.inputs = InputRange(u_min, u_max, levels=levels)
+        if self.crossed:
+            self.inputs = UsualLimits(condensed, levels).inputs
         self.du_max = np.clip(given("du_max", n_c), 0.0, usual.du_max)
         # Beyond what counts as a number a limit is as good as none, or as one that nothing can keep.
         self.y_min = np.minimum(given("y_min", n_p), LARGEST)

@@ -178,7 +178,7 @@ class BoundsNow:
     ) -> None:
         self._kept = KEPT * input_prefix
         self.lower, self.upper, self._rows = lower, upper, bounded_rows
-        self._low, self._high, self._bound_of_move = low, high, bound_of_move.reshape(low.shape)
+        self.low, self.high, self._bound_of_move = low, high, bound_of_move.reshape(low.shape)
 
     def margins(self, moves: Array) -> Array:
         """How far moves, shape (n_moves,), keep from each lower bound and, behind that, each upper one."""
@@ -191,10 +191,10 @@ class BoundsNow:
         An input that does not move at some samples has to keep, from its last move on, the limits of all of
         them.
         """
-        lower, upper, moved = self.lower.copy(), self.upper.copy(), pattern.reshape(self._low.shape)
-        low, high = self._low[-1].copy(), self._high[-1].copy()
+        lower, upper, moved = self.lower.copy(), self.upper.copy(), pattern.reshape(self.low.shape)
+        low, high = self.low[-1].copy(), self.high[-1].copy()
         for j in range(len(moved) - 1, -1, -1):
-            low, high = np.maximum(low, self._low[j]), np.minimum(high, self._high[j])
+            low, high = np.maximum(low, self.low[j]), np.minimum(high, self.high[j])
             now = moved[j]
             at, known = self._bound_of_move[j][now], self._bound_of_move[j][now] >= 0
             lower[at[known]], upper[at[known]] = low[now][known], high[now][known]

@@ -37,6 +37,8 @@ class Rule(Controller):
             raise MampcError(
                 f"controller: expected one such as mampc.MPC, received {type(controller).__name__}"
             )
+        if controller.levels is not None:
+            raise MampcError("controller: expected one whose inputs take any value, received one with levels")
         super().__init__(controller.problem, condensed=controller.condensed)
         self.controller = controller
         self._memory = controller.memory

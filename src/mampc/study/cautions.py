@@ -9,7 +9,6 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.controllers.offset import largest_offset, largest_saving
 from mampc.methods.registry import METHODS
-from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import TrackingProblem
 from mampc.program.steady import SteadyTarget
@@ -98,7 +97,7 @@ def _never_pays(study: Study, condensed: CondensedQP, levels: Array) -> list[str
     for table in study.controllers:
         if table.rules is None or table.method not in METHODS or not saving > 0:
             continue
-        rules = MoveRules(**table.rules.model_dump())
+        rules = table.rules.made()
         price = float(np.min(rules.price))
         if price >= saving:
             found.append(

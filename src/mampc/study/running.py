@@ -24,7 +24,6 @@ from mampc.loop.sensors import SensorChecks
 from mampc.loop.simulation import Course, acting_on, at_rest, closed_loop
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
-from mampc.moves.rules import MoveRules
 from mampc.plants import Plant
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.rivals.registry import RIVALS, rival
@@ -311,7 +310,7 @@ def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
 def _sparse(problem: TrackingProblem, table: ControllerTable, method: str, settings: dict[str, Any]) -> MAMPC:
     assert table.rules is not None
     return MAMPC(
-        problem, MoveRules(**table.rules.model_dump()), method=method,
+        problem, table.rules.made(), method=method,
         on_limit_violation=table.on_limit_violation, violation_margin=table.violation_margin, **settings,
     )  # fmt: skip
 

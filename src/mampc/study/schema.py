@@ -27,6 +27,7 @@ from mampc.loop.valves import Valves
 from mampc.methods.registry import METHODS, method_of
 from mampc.moves.rules import MoveRules
 from mampc.plants import Level, QuadrupleTank, SolidOxideFuelCell, VanDeVusse, ogunnaike_ray, wood_berry
+from mampc.program.levels import OnOff
 from mampc.program.problem import LONGEST_HORIZON
 from mampc.rivals.registry import RIVALS, RULES, check_settings
 
@@ -275,6 +276,24 @@ class PublishedTable(Table):
     without_transient: PublishedTable | None = None
 
 
+class OnOffTable(Table):
+    """As `mampc.OnOff`; times in seconds or with a unit."""
+
+    off: Number | None = None
+    on: Number | None = None
+    min_on: Lag = 0.0
+    min_off: Lag = 0.0
+    starts_per_hour: Count | None = None
+
+
+# A step, a list of levels, on and off, or "any" for an input that takes any value.
+Levels = (
+    Positive
+    | OnOffTable
+    | list[Positive | Annotated[list[Number], Field(min_length=1)] | OnOffTable | Literal["any"]]
+)
+
+
 class RulesTable(Table):
     max_moves: Whole | None = None
     sparsity_horizon: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = 1
@@ -284,14 +303,28 @@ class RulesTable(Table):
     dwell: Annotated[int, Field(ge=1, le=LONGEST_HORIZON)] = 1
     max_moves_per_step: Count | None = None
     blocks: Annotated[list[Count], Field(min_length=1)] | None = None
+    levels: Levels | None = None
+
+    def made(self) -> MoveRules:
+        """The rules that the table describes."""
+        levels = (
+            [_entry(entry) for entry in self.levels] if isinstance(self.levels, list) else _entry(self.levels)
+        )
+        return MoveRules(**self.model_dump(exclude={"levels"}), levels=levels)
 
     @model_validator(mode="after")
     def _consistent(self) -> RulesTable:
         try:
-            MoveRules(**self.model_dump())
+            self.made()
         except MampcError as error:
             raise ValueError(f"other rules: {error}") from None
         return self
+
+
+def _entry(levels: Any) -> Any:
+    if isinstance(levels, OnOffTable):
+        return OnOff(**levels.model_dump())
+    return None if levels == "any" else levels
 
 
 class ControllerTable(Table):

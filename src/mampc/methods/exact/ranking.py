@@ -42,7 +42,7 @@ class Ranking:
         self.patterns: BoolArray = patterns[order]
         ends = np.searchsorted(counts[order], np.arange(counts.max() + 1), side="right").tolist()
         # A free move more never costs more: then only patterns that spend the whole budget are of interest.
-        nested = admissible.simple and not admissible.priced and not admissible.sized
+        nested = admissible.nested
         starts = [0, *ends[:-1]] if nested else [0] * len(ends)
         self._rows_within = [slice(start, end) for start, end in zip(starts, ends, strict=True)]
         self.charge = np.array([admissible.charge(pattern) for pattern in self.patterns])

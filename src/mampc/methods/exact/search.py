@@ -18,7 +18,8 @@ from time import perf_counter
 
 import numpy as np
 
-from mampc.base.checks import Array, as_number
+from mampc.base.checks import Array, BoolArray, as_number
+from mampc.base.errors import MampcError
 from mampc.base.tolerances import INSIDE, TIE, tie
 from mampc.base.words import Remark, Status
 from mampc.methods.exact.open_patterns import OpenPatterns
@@ -27,12 +28,13 @@ from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.tree import PatternTree
 from mampc.methods.method import HELD_BY, Plan
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
-from mampc.moves.pattern_solver import Incumbent, PatternSolver
+from mampc.moves.pattern_solver import Incumbent, OnPattern, PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.qp import QPStatus
 from mampc.program.sample import LeastSquares, Sample
 
+MOST_BESIDE_LEVELS = 1000  # patterns of inputs without levels that are tried one by one
 TOGETHER = 3  # patterns of the table whose limits are priced together
 
 
@@ -71,12 +73,21 @@ class ExactSearch:
         # After a move of more than half its range an input can only go back; the tree knows where inputs are.
         limits, size = problem.limits, self.admissible.min_size[: problem.model.n_inputs]
         coarse = bool((2 * size > limits.u_max - limits.u_min).any())
+        self._solver = PatternSolver(condensed, self.admissible)
+        self._ranking: Ranking | None = None
+        self._free = self._patterns_beside_levels()
+        if self._free is not None:
+            return
         # Zones give patterns no bound that needs no solver.
         zoned = condensed.bounds.zones is not None and not self.admissible.sized
+        if zoned and self.admissible.on_levels:
+            raise MampcError(
+                f"levels: expected at most {MOST_BESIDE_LEVELS} patterns of the inputs without levels where outputs "
+                "have zones, received more; shorten the control horizon"
+            )
         self._ranking = None if coarse or zoned else ranking_of(condensed, self.admissible)
-        self._solver = PatternSolver(condensed, self.admissible)
         if self._ranking is None:
-            self._tree = PatternTree(condensed, self.admissible, self._solver, settings.time_limit)
+            self._tree = PatternTree(condensed, self.admissible, settings.time_limit)
         self._relaxation: Relaxation | None = None
         if self._ranking is not None and condensed.bounds.every_move:
             self._relaxation = Relaxation(condensed, np.arange(condensed.n_moves), condensed.U)
@@ -86,20 +97,31 @@ class ExactSearch:
         """Whether all patterns are listed."""
         return self._ranking is not None
 
+    def _patterns_beside_levels(self) -> BoolArray | None:
+        """The patterns, shape (K, n_moves), of inputs without levels where others have some, if they are few."""
+        free = self._solver.free
+        if free is None:
+            return None
+        if self.admissible.nested and self.admissible.rules.max_moves is None:
+            return (self.admissible.candidates & free)[None]
+        return self.admissible.listed(MOST_BESIDE_LEVELS, free)
+
     def plan(self, sample: Sample, inputs: Array, guess: Array | None = None) -> Plan:
         """The best moves of all admissible patterns for one sample."""
-        past = self.admissible.allowance(inputs, sample.frozen)
+        past, solver = self.admissible.allowance(inputs, sample.frozen), self._solver.after(inputs)
         if past.exceeded:
-            return self._search(sample, past)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
-        return self._search(sample, past)
+            return self._search(sample, past, solver)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
+        return self._search(sample, past, solver)
 
-    def _search(self, sample: Sample, past: Allowance) -> Plan:
+    def _search(self, sample: Sample, past: Allowance, solver: PatternSolver) -> Plan:
+        if self._free is not None:
+            return self._search_levels(self._free, sample, past, solver)
         ranking = self._ranking
         if ranking is None:
-            return self._search_tree(sample, past)
+            return self._search_tree(sample, past, solver)
         bounds = ranking.bounds(sample.moves, sample.cost, past, sample.later_data)
         best = int(bounds.argmin())
-        if not self.admissible.sized:
+        if not (self.admissible.sized or self.admissible.on_levels):
             at = ranking.rows(past).start + best
             optimum = ranking.optimum(at, sample)
             margins = optimum.margins
@@ -109,13 +131,41 @@ class ExactSearch:
                     return Plan(
                         optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs, objective,
                     )  # fmt: skip
-        return self._search_ranking(ranking, bounds, sample, past)
+        return self._search_ranking(ranking, bounds, sample, past, solver)
 
     def _deadline(self) -> float:
         limit = self.settings.time_limit
         return np.inf if limit is None else perf_counter() + 0.95 * limit
 
-    def _search_ranking(self, ranking: Ranking, bounds: Array, sample: Sample, past: Allowance) -> Plan:
+    def _search_levels(
+        self, patterns: BoolArray, sample: Sample, past: Allowance, solver: PatternSolver
+    ) -> Plan:
+        """All courses of inputs on levels, in the order of time, beside each pattern of the others."""
+        best, deadline, limits, open_bound = Incumbent(), self._deadline(), None, np.inf
+        if self.condensed.bounds.zones is not None or sample.margins.min(initial=np.inf) < 0:
+            plain = self.condensed.plain.solve(sample.moves, sample.lower, sample.upper)
+            limits = solver.priced(sample, plain.multipliers)
+        allowed = self.admissible.open(past)
+        for free in patterns:
+            if len(patterns) == 1:
+                free = free & allowed
+            elif (free & ~allowed).any() or self.admissible.count(free) > past.left:
+                continue
+            if best.moves is not None and perf_counter() > deadline:
+                open_bound = min(open_bound, sample.cost)
+                break
+            found = solver.best_course(sample, past, free, limits, best.objective, deadline)
+            status = QPStatus.OPTIMAL if found.complete else QPStatus.TIME_LIMIT
+            best.offer(OnPattern(found.moves, found.objective, status, None, found.visited))
+            if not found.complete:
+                open_bound = min(open_bound, found.bound)
+        if open_bound < best.objective:
+            return self._plan(sample, best, open_bound, Status.TIME_LIMIT)
+        return self._plan(sample, best, best.objective)
+
+    def _search_ranking(
+        self, ranking: Ranking, bounds: Array, sample: Sample, past: Allowance, solver: PatternSolver
+    ) -> Plan:
         """Patterns of the table best bound first, bounded anew whenever a program shows other multipliers."""
         best, deadline, condensed = Incumbent(), self._deadline(), self.condensed
         rounding, first = condensed.rounding(sample), None
@@ -130,7 +180,7 @@ class ExactSearch:
                 return self._plan(sample, best, best.objective)
             if perf_counter() > deadline:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
-            solved = self._solver.solve(sample, ranking.patterns[open_.rows[at]], best.objective, deadline)
+            solved = solver.solve(sample, ranking.patterns[open_.rows[at]], best.objective, deadline)
             best.offer(solved)
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
@@ -146,9 +196,9 @@ class ExactSearch:
                     if together is not None:
                         open_.price(together, cutoff)
 
-    def _search_tree(self, sample: Sample, past: Allowance) -> Plan:
+    def _search_tree(self, sample: Sample, past: Allowance, solver: PatternSolver) -> Plan:
         best = Incumbent()
-        open_bound = self._tree.search(sample, past, best, self._deadline())
+        open_bound = self._tree.search(sample, past, best, self._deadline(), solver)
         if open_bound < best.objective:
             return self._plan(sample, best, open_bound, Status.TIME_LIMIT)
         return self._plan(sample, best, best.objective)

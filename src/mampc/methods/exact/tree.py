@@ -42,10 +42,9 @@ class PatternTree:
         self,
         condensed: CondensedQP,
         admissible: AdmissiblePatterns,
-        solver: PatternSolver,
         time_limit: float | None,
     ) -> None:
-        self._admissible, self._solver = admissible, solver
+        self._admissible = admissible
         order = np.flatnonzero(admissible.candidates)
         self._squares = Squares(condensed, order)
         self._relaxation = Relaxation(
@@ -54,27 +53,31 @@ class PatternTree:
         self._local = LocalSearch(condensed, admissible)
         # A price per unit says little of moves that can be large.
         limits = condensed.problem.limits
-        self._close = admissible.priced and not admissible.sized and bool(np.isfinite(limits.du_max).any())
+        self._close = admissible.priced and not (admissible.sized or admissible.on_levels)
+        self._close &= bool(np.isfinite(limits.du_max).any())
         # Relaxed without their bounds, errors of zones tell nothing.
         self._zoned = condensed.bounds.zones is not None and not admissible.sized
 
-    def search(self, sample: Sample, allowance: Allowance, best: Incumbent, deadline: float) -> float:
+    def search(
+        self, sample: Sample, allowance: Allowance, best: Incumbent, deadline: float, solver: PatternSolver
+    ) -> float:
         """Visit every admissible pattern that may cost less than the best plan, to which better ones are offered.
 
         Args:
             deadline: of `perf_counter`.
+            solver: of the programs on patterns.
 
         Returns:
             A lower bound over everything that was not visited: infinite when the search is complete.
         """
         problem = SampleProblem(
-            self._squares, self._relaxation, self._admissible, self._solver, sample, allowance, best, deadline
+            self._squares, self._relaxation, self._admissible, solver, sample, allowance, best, deadline
         )
         problem.offer(problem.pattern(np.zeros(0, dtype=np.intp)))
         if not (allowance.left > 0 and len(problem.order)):
             return np.inf
         if self._zoned:
-            return self._search_zones(problem)
+            return self._search_zones(problem, solver)
         limited = bool(sample.margins.min(initial=np.inf) < 0)
         if limited or self._admissible.priced:
             self._relax_root(problem)
@@ -82,13 +85,13 @@ class PatternTree:
             return Branching(problem).run()
         terms, f = problem.terms, np.zeros(self._admissible.n_moves)
         f[problem.order] = -2.0 * (terms.c[:, -1] @ self._squares.L[:, :-1])
-        self._local.offer(self._solver, sample, f, allowance, best, deadline)
+        self._local.offer(solver, sample, f, allowance, best, deadline)
         found = problem.relaxation.of_bounds(best.multipliers)
         if found is not None and found.active:
             terms.add(found)
         return _BatchSearch(problem).run()
 
-    def _search_zones(self, problem: SampleProblem) -> float:
+    def _search_zones(self, problem: SampleProblem, solver: PatternSolver) -> float:
         """The search where outputs have zones, from what a local search finds with set points in place of these."""
         if problem.terms.rest[0] >= problem.cutoff:
             return np.inf
@@ -96,7 +99,7 @@ class PatternTree:
         multipliers = plain.solve(sample.moves, sample.lower, sample.upper).multipliers
         if multipliers is not None:
             f, _ = self._squares.condensed.relaxed_limits(sample, multipliers)
-            self._local.offer(self._solver, sample, f, problem.allowance, problem.best, problem.deadline)
+            self._local.offer(solver, sample, f, problem.allowance, problem.best, problem.deadline)
         return Branching(problem).run()
 
     def _relax_root(self, problem: SampleProblem) -> None:
