@@ -14,7 +14,6 @@ import numpy as np
 
 from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError
-from mampc.base.tolerances import SAME
 from mampc.loop.batch import simulate_batch
 from mampc.loop.disturbances import response_within_reach
 from mampc.loop.estimation import static_response
@@ -233,18 +232,28 @@ class Scenarios:
 
     def run(self, regulator: Regulator) -> tuple[Array, Array]:
         """Moves of all inputs together and tracking error, mean of (y - r)' Q (y - r), of each loop, shapes (S,)."""
+        (answer,) = self.run_each([regulator])
+        return answer
+
+    def run_each(self, regulators: Sequence[Regulator]) -> list[tuple[Array, Array]]:
+        """The same under several regulators, such as values of a setting, which are stepped together."""
+        count = len(regulators)
+        at_inputs, at_outputs, measured, reference = (
+            np.tile(course, (count, 1, 1))
+            for course in (self.at_inputs, self.at_outputs, self.measured, self.reference)
+        )
         batch = simulate_batch(
-            self.plants, regulator, self.reference, seeds=self.seeds, noise=self.noise,
-            input_disturbance=self.at_inputs, output_disturbance=self.at_outputs,
-            measured_disturbance=self.measured if self.measured.shape[2] else None,
-            u_initial=self.u_initial, progress=False,
+            self.plants * count, [own for own in regulators for _ in self.seeds], reference,
+            seeds=self.seeds * count, noise=self.noise, input_disturbance=at_inputs, output_disturbance=at_outputs,
+            measured_disturbance=measured if measured.shape[2] else None, u_initial=self.u_initial, progress=False,
         )  # fmt: skip
         changes = np.abs(np.diff(np.concatenate([batch.u_initial[:, None], batch.u], axis=1), axis=1))
-        moves = (changes > SAME * regulator.controller.condensed.input_prefix).sum(axis=(1, 2)).astype(float)
+        moves = (changes > batch.resolution[:, None]).sum(axis=(1, 2)).astype(float)
         with np.errstate(over="ignore", invalid="ignore"):
             off = batch.y - batch.r
             error = np.einsum("sti,ij,stj->s", off, self.weight, off) / off.shape[1]
-        return moves, np.where(np.isfinite(error), error, np.inf)
+        error = np.where(np.isfinite(error), error, np.inf)
+        return list(zip(moves.reshape(count, -1), error.reshape(count, -1), strict=True))
 
 
 def _stand_in(off: Mismatch, model: StateSpace, seed: int) -> StateSpace:

@@ -68,7 +68,8 @@ class Candidate:
 
     def points(self, prices: Sequence[float], scenarios: Scenarios) -> list[Point]:
         """Its moves and errors in every scenario, price by price."""
-        return [Point(self.name, price, *scenarios.run(self.regulator(price))) for price in prices]
+        found = scenarios.run_each([self.regulator(price) for price in prices])
+        return [Point(self.name, price, *run) for price, run in zip(prices, found, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -354,7 +355,7 @@ def candidates(problem: TrackingProblem, noise: Array, guessed: bool = False) ->
     """All that are compared, for a problem of plain MPC and noise (l,) that was told or guessed."""
     m, n_p = problem.model.n_inputs, problem.prediction_horizon
     n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
-    estimator, found = LoadBank(problem.model, noise=noise), []
+    estimator, found = LoadBank(problem.model, noise=noise, guessed=guessed), []
     for share in MOVE_WEIGHTS:
         for tail in TAILS:
             sparse = replace(

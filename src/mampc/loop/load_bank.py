@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray, as_vector, is_usable
+from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
 from mampc.loop.estimation import Estimate, Estimator, Updated
@@ -33,10 +33,8 @@ TO_JUMP = 0.001  # chance that it jumps; what is left goes to the other hypothes
 JUMP_GOES_ON = 0.3  # chance that a jump takes one more sample
 FORGETS = 0.01  # share by which a sample counts in what usually holds
 LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
-NOISE_TOLD, NOISE_REMEMBERED = (
-    10.0,
-    100.0,
-)  # samples' worth of what is told of the noise, and of what is seen of it
+NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
+NOISE_REMEMBERED = 100.0  # and of what is seen of it
 NOISE_RANGE = (0.01, 100.0)  # of the variance, beside what was told
 UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
@@ -93,6 +91,7 @@ class LoadBank(Estimator):
             too large, loads are found later, and twice too small, noise is taken for loads, until some hundred samples
             have shown how large it is. Default: what the record of an identified model showed (`model.noise`); see
             `for_problem` for a guess.
+        guessed: whether this noise is a guess, which a few samples outweigh.
         hypotheses: about the load, at least one; see `HYPOTHESES`.
 
     Raises:
@@ -100,7 +99,12 @@ class LoadBank(Estimator):
     """
 
     def __init__(
-        self, model: StateSpace, *, noise: Any = None, hypotheses: tuple[Hypothesis, ...] = HYPOTHESES
+        self,
+        model: StateSpace,
+        *,
+        noise: Any = None,
+        guessed: bool = False,
+        hypotheses: tuple[Hypothesis, ...] = HYPOTHESES,
     ) -> None:
         if not isinstance(model, StateSpace):
             raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
@@ -117,6 +121,7 @@ class LoadBank(Estimator):
         sizes = as_vector("noise", noise, model.n_outputs)
         if (sizes <= 0).any():
             raise MampcError(f"noise: expected positive numbers, received {sizes}")
+        self._told = NOISE_GUESSED if as_flag("guessed", guessed) else NOISE_TOLD
         self.model, self.noise, self.hypotheses = model, sizes, tuple(hypotheses)
         self.loads = Loads.of(model, sizes)
         try:
@@ -157,7 +162,7 @@ class LoadBank(Estimator):
             )
             if not (np.isfinite(reach) & (reach > 0)).all():
                 raise MampcError("noise: expected standard deviations, since inputs without limits tell none")
-            noise = NOISE_OF_REACH * reach
+            return cls(model, noise=NOISE_OF_REACH * reach, guessed=True)
         return cls(model, noise=noise)
 
     def __repr__(self) -> str:
@@ -233,7 +238,7 @@ class LoadBank(Estimator):
             x = np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
         usual = self._lasts / self._lasts.sum()
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
-        return self._estimate(members, usual @ self._chances, usual, np.array([1.0, NOISE_TOLD]))
+        return self._estimate(members, usual @ self._chances, usual, np.array([1.0, self._told]))
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""

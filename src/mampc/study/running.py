@@ -319,6 +319,8 @@ def _estimator(study: Study, problem: TrackingProblem) -> Estimator:
     table = study.estimator
     try:
         if table.kind == "load_bank":
+            if table.price_follows_noise and table.measurement_noise is not None:
+                return LoadBank(problem.model, noise=table.measurement_noise, guessed=True)
             return LoadBank.for_problem(problem, noise=table.measurement_noise)
         settings = table.model_dump(exclude={"kind", "value_of_information", "price_follows_noise"})
         return KalmanFilter.offset_free(problem.model, **settings)
