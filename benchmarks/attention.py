@@ -27,6 +27,7 @@ import numpy as np
 from joblib import Parallel, delayed
 
 import mampc
+from attention_limits import SCENARIOS, limit
 from mampc import loads, rivals
 from mampc.compare.fronts import Point, moves_at
 from mampc.compare.journal import Journal
@@ -163,6 +164,8 @@ METHODS = {
     "event-triggered": DRIFTS,
     "l1 on moves": DRIFTS,
 }
+LIMITS = ("non-anticipative", "clairvoyant")
+EVERYTHING = METHODS | dict.fromkeys(LIMITS, ())
 
 
 def measured(case: Case, kind: str, method: str, structure: tuple, knobs: Any, seeds: range) -> list[Point]:
@@ -187,7 +190,13 @@ def knob_at(points: list[Point], baseline: Point) -> float:
 
 def cell(name: str, kind: str, method: str, quick: bool) -> dict:
     """One method on one plant under one kind of load: tuned, then measured in other scenarios."""
-    case, began = cases()[name], time.time()
+    case, began = cases()[name], time.process_time()
+    if method in LIMITS:
+        [baseline] = measured(case, kind, *BASELINE, [1.0], SCENARIOS)
+        around = load_of(kind, case), reference_of(case), 0.1 / per_input(case) ** 2
+        return row(
+            name, kind, method, None, None, [baseline, *limit(method, case, kind, *around, baseline)], began
+        )
     knobs, about = (KNOB[::2], ABOUT[::4]) if quick else (KNOB, ABOUT)
     tuning, evaluation = (TUNING[:1], EVALUATION[:2]) if quick else (TUNING, EVALUATION)
     [base], [baseline] = (measured(case, kind, *BASELINE, [1.0], seeds) for seeds in (tuning, evaluation))
@@ -197,30 +206,44 @@ def cell(name: str, kind: str, method: str, quick: bool) -> dict:
     best = int(np.argmin(np.where(np.isfinite(at), at, np.inf)))
     knob, structure = knob_at(each[best], base), structures[best]
     points = measured(case, kind, method, structure, knob * about, evaluation)
+    return row(name, kind, method, structure, at[best], [baseline, *points], began)
+
+
+def row(
+    name: str, kind: str, method: str, structure: Any, tuned: Any, points: list[Point], began: float
+) -> dict:
+    """What is kept of a cell; plain MPC is the first of the points."""
     return {
-        "plant": name, "load": kind, "method": method, "structure": structure, "tuned to": at[best],
+        "plant": name, "load": kind, "method": method, "structure": structure, "tuned to": tuned,
         "points": [
             {"knob": p.value, "moves": p.moves.tolist(), "error": [float(f"{e:.6g}") for e in p.error]}
-            for p in (baseline, *points)
+            for p in points
         ],
-        "seconds": round(time.time() - began, 1),
+        "seconds": round(time.process_time() - began, 1),
     }  # fmt: skip
 
 
-def run(quick: bool, jobs: int, plants: list[str], again: list[str]) -> None:
-    """Whatever is not finished; the results of all that is."""
+def journals_of(quick: bool, again: list[str]) -> dict[str, Journal]:
+    """What is finished of every method, by plant and load."""
     journals = {}
-    for method, structures in METHODS.items():
+    for method, structures in EVERYTHING.items():
         constants = f"{quick} {TUNING} {EVALUATION} {STEPS} {KNOB} {ABOUT} {RATIO} {method} {structures}"
         path = RESULTS / "attention" / f"{method.replace(', ', '-').replace(' ', '-')}.jsonl"
         path.parent.mkdir(parents=True, exist_ok=True)
         if method in again:
             path.unlink(missing_ok=True)
         journals[method] = Journal(path, hashlib.sha256(constants.encode()).hexdigest()[:16])
-    work = [(name, kind) for kind in LOADS for name in cases() if not plants or name in plants]
+    return journals
+
+
+def run(journals: dict[str, Journal], quick: bool, jobs: int, plants: list[str], methods: list[str]) -> None:
+    """Whatever is not finished."""
     missing = [
-        (*where, method) for method in METHODS for where in work if str(where) not in journals[method].done
-    ]
+        (name, kind, method)
+        for method in EVERYTHING for kind in LOADS for name in cases()
+        if (not plants or name in plants) and (not methods or method in methods)
+        and str((name, kind)) not in journals[method].done
+    ]  # fmt: skip
     began = time.time()
     parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
     results = parallel(delayed(cell)(*task, quick) for task in missing)
@@ -229,15 +252,25 @@ def run(quick: bool, jobs: int, plants: list[str], again: list[str]) -> None:
         left = (time.time() - began) / number * (len(missing) - number)
         told = ", ".join(found[key] for key in ("plant", "load", "method"))
         print(f"{number} of {len(missing)}, {left / 60:.0f} min left: {told}", file=sys.stderr)
-    rows = [journals[method].done[str(where)][0] for where in work for method in METHODS]
+
+
+def collect(journals: dict[str, Journal], quick: bool) -> None:
+    """All that is finished, and what made it, into attention.json."""
+    rows = [
+        row
+        for name in cases() for kind in LOADS for method in EVERYTHING
+        for row in journals[method].done.get(str((name, kind)), [])
+    ]  # fmt: skip
     made_by = {
-        "command": "python " + " ".join(["benchmarks/attention.py", *sys.argv[1:]]),
+        "command": "python benchmarks/attention.py" + (" --quick" if quick else ""),
         "python": platform.python_version(), "numpy": np.__version__, "mampc": mampc.__version__,
         "machine": platform.machine(), "minutes of one core": round(sum(row["seconds"] for row in rows) / 60, 1),
         "samples": STEPS, "scenarios to tune in": len(TUNING[:1] if quick else TUNING),
         "scenarios to measure in": len(EVALUATION[:2] if quick else EVALUATION),
     }  # fmt: skip
-    (RESULTS / "attention.json").write_text(json.dumps({"made by": made_by, "cells": rows}, indent=0) + "\n")
+    lines = ",\n".join(json.dumps(row) for row in rows)
+    text = f'{{"made by": {json.dumps(made_by, indent=1)},\n"cells": [\n{lines}\n]}}\n'
+    (RESULTS / "attention.json").write_text(text, encoding="utf-8")
 
 
 def main() -> None:
@@ -247,13 +280,16 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer seeds and settings, to see that it runs")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--plants", nargs="*", default=[], help="only these")
+    parser.add_argument("--methods", nargs="*", default=[], help="only these")
     parser.add_argument("--again", nargs="*", default=[], help="methods to run anew")
     parser.add_argument(
         "--draw", action="store_true", help="tables and the heat map from the results there are"
     )
     given = parser.parse_args()
+    journals = journals_of(given.quick, given.again)
     if not given.draw:
-        run(given.quick, given.jobs, given.plants, given.again)
+        run(journals, given.quick, given.jobs, given.plants, given.methods)
+    collect(journals, given.quick)
     import attention_report
 
     attention_report.write(RESULTS / "attention.json")

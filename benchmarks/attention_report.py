@@ -4,109 +4,242 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from mampc.compare.fronts import Point, moves_at
+
 DOCS = Path(__file__).parent.parent / "docs"
-RATIO = "1.25"
+RATIO, RATIOS = 1.25, (1.05, 1.1, 1.25, 1.5)
 BEGIN, END = "<!-- attention, by `make attention` -->", "<!-- end of attention -->"
-OURS = "exact price"
+OURS = ("exact price, load bank", "exact price")
+LIMITS = ("non-anticipative", "clairvoyant")
+SURE = 2.0  # standard errors
+
+
+class Moves(NamedTuple):
+    """Moves in percent of plain MPC's, with the standard error; infinite where the error is never reached."""
+
+    value: float
+    error: float
+
+    def __str__(self) -> str:
+        spread = f" ± {self.error:.1f}" if np.isfinite(self.error) else ""
+        return f"{self.value:.1f}{spread}" if np.isfinite(self.value) else "not reached"
+
+
+Cells = dict[tuple[str, str], dict[str, dict[float, Moves]]]  # plant and load -> method -> ratio of errors
 
 
 def write(results: Path) -> None:
+    """Put the results into docs/comparison.md, and draw the heat map."""
     content = json.loads(results.read_text(encoding="utf-8"))
-    cells = content["cells"]
-    methods = [name for name in cells[0] if name not in ("plant", "load", "moves of MPC")]
-    methods.sort(key=lambda name: name != OURS)
+    cells = cells_of(content["cells"])
+    methods = list(dict.fromkeys(name for cell in cells.values() for name in cell if name not in LIMITS))
     page = DOCS / "comparison.md"
     text = page.read_text(encoding="utf-8")
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     figure = "![Moves of the exact price over those of the best rival](images/attention.svg)"
-    body = "\n\n".join(
-        [figure, made_by(content["made by"]), by_load(cells, methods), by_cell(cells, methods)]
-    )
+    parts = [made_by(content["made by"]), figure, standing(cells, methods), by_load(cells, methods)]
+    parts += [by_ratio(cells, methods), losses(cells, methods), by_cell(cells, methods)]
+    if any(name in cell for cell in cells.values() for name in LIMITS):
+        parts.append(limits(cells))
+    body = "\n\n".join(parts)
     page.write_text(f"{text[:start]}\n\n{body}\n\n{text[end:]}", encoding="utf-8")
     draw(cells, methods)
 
 
-def made_by(how: dict) -> str:
+def cells_of(rows: list[dict[str, Any]]) -> Cells:
+    cells: Cells = {}
+    for row in rows:
+        points = [
+            Point(row["method"], p["knob"], np.array(p["moves"]), np.array(p["error"])) for p in row["points"]
+        ]
+        found = {}
+        for ratio in RATIOS:
+            value, error = moves_at(points[1:], points[0], ratio)
+            found[ratio] = Moves(100 * value if np.isfinite(value) else np.inf, 100 * error)
+        cells.setdefault((row["plant"], row["load"]), {})[row["method"]] = found
+    return cells
+
+
+def made_by(how: dict[str, Any]) -> str:
     return (
-        f"`{how['command']}`, {how['minutes']:g} minutes; {how['steps']} samples, {how['tuning seeds']} seeds to "
-        f"tune on, {how['evaluation seeds']} others to measure on; Python {how['python']}, NumPy {how['numpy']}, "
-        f"{how['machine']}."
+        f"`{how['command']}`, {how['minutes of one core']:g} minutes of one core; {how['samples']} samples, "
+        f"{how['scenarios to tune in']} scenarios to tune in, {how['scenarios to measure in']} others to measure in; "
+        f"Python {how['python']}, NumPy {how['numpy']}, {how['machine']}."
     )
 
 
-def share(cell: dict, method: str) -> float:
-    """Moves in percent of plain MPC's; infinite where the error is never reached."""
-    value = cell[method][RATIO][0]
-    return 100 * value if value is not None and np.isfinite(value) else np.inf
+def best_rival(cell: dict[str, dict[float, Moves]], ratio: float = RATIO) -> tuple[str, Moves]:
+    rivals = {name: found[ratio] for name, found in cell.items() if name not in (*OURS, *LIMITS)}
+    name = min(rivals, key=lambda name: rivals[name].value)
+    return name, rivals[name]
 
 
-def by_load(cells: list[dict], methods: list[str]) -> str:
-    """Geometric means over plants, and how often the error is reached."""
-    kinds = list(dict.fromkeys(cell["load"] for cell in cells))
+def factor(own: Moves, other: Moves) -> tuple[float, float]:
+    """One over the other, and the standard error of its logarithm."""
+    if not np.isfinite(own.value):
+        return np.inf, 0.0
+    return own.value / other.value, float(np.hypot(own.error / own.value, other.error / other.value))
+
+
+def mean(values: list[float]) -> str:
+    reached = [value for value in values if np.isfinite(value)]
+    number = f"{np.exp(np.log(reached).mean()):.1f}" if reached else "-"
+    return number if len(reached) == len(values) else f"{number} ({len(reached)} of {len(values)})"
+
+
+def standing(cells: Cells, methods: list[str]) -> str:
+    """Wins, ties and losses of ours, in words."""
+    lines = []
+    for name in [name for name in OURS if name in methods]:
+        factors = [factor(cell[name][RATIO], best_rival(cell)[1]) for cell in cells.values() if name in cell]
+        fewer = sum(f < 1 and np.log(f) < -SURE * e for f, e in factors)
+        more = sum(f > 1 and (np.isinf(f) or np.log(f) > SURE * e) for f, e in factors)
+        never = sum(np.isinf(f) for f, _ in factors)
+        reached = [f for f, _ in factors if np.isfinite(f)]
+        text = (
+            f"**{name}**: {np.exp(np.log(reached).mean()):.2f} times the moves of the best rival of each cell, "
+            f"geometric mean over {len(reached)} cells; fewer moves in {fewer}, more in {more}, and "
+            f"{len(factors) - fewer - more} that are closer than {SURE:g} standard errors."
+        )
+        lines.append(text + (f" Never within the error in {never}." if never else ""))
+    return "\n\n".join([f"At {RATIO:g} times plain MPC's error:", *lines])
+
+
+def by_load(cells: Cells, methods: list[str]) -> str:
+    kinds = list(dict.fromkeys(load for _, load in cells))
     lines = [
-        "Moves in percent of plain MPC's at 1.25 times its error, geometric mean over the plants where it is reached "
-        "(how many, where not all).",
+        f"Moves in percent of plain MPC's at {RATIO:g} times its error, geometric mean over the plants where it is "
+        "reached (how many, where not all).",
         "",
         "| method | " + " | ".join(kinds) + " | all |",
         "|---|" + "---|" * (len(kinds) + 1),
     ]
     for method in methods:
-        row = [method]
-        for kind in [*kinds, None]:
-            values = np.array([share(c, method) for c in cells if kind in (None, c["load"])])
-            reached = values[np.isfinite(values)]
-            mean = f"{np.exp(np.log(reached).mean()):.1f}" if len(reached) else "-"
-            row.append(mean if len(reached) == len(values) else f"{mean} ({len(reached)} of {len(values)})")
-        lines.append("| " + " | ".join(row) + " |")
+        row = [
+            mean(
+                [
+                    c[method][RATIO].value
+                    for (_, load), c in cells.items()
+                    if method in c and kind in (None, load)
+                ]
+            )
+            for kind in [*kinds, None]
+        ]
+        lines.append("| " + " | ".join([method, *row]) + " |")
     return "\n".join(lines)
 
 
-def by_cell(cells: list[dict], methods: list[str]) -> str:
-    """Every cell, with standard errors, the fewest in bold."""
+def by_ratio(cells: Cells, methods: list[str]) -> str:
+    """At other errors, over all plants and loads."""
     lines = [
-        "Each plant and load, with the standard error; the fewest moves are in bold.",
+        "The same over all plants and loads, at other errors.",
+        "",
+        "| method | " + " | ".join(f"{ratio:g} x MPC's error" for ratio in RATIOS) + " |",
+        "|---|" + "---|" * len(RATIOS),
+    ]
+    for method in methods:
+        row = [mean([c[method][ratio].value for c in cells.values() if method in c]) for ratio in RATIOS]
+        lines.append("| " + " | ".join([method, *row]) + " |")
+    return "\n".join(lines)
+
+
+def losses(cells: Cells, methods: list[str]) -> str:
+    """Where ours makes more moves than a rival, and than which."""
+    ours = next(name for name in OURS if name in methods)
+    found = []
+    for (plant, load), cell in cells.items():
+        if ours not in cell:
+            continue
+        rival, moves = best_rival(cell)
+        ratio, error = factor(cell[ours][RATIO], moves)
+        if np.isinf(ratio):
+            found.append(
+                (ratio, f"- {plant}, {load}: never within the error, which {rival} is with {moves} %")
+            )
+        elif np.log(ratio) > SURE * error:
+            found.append((ratio, f"- {plant}, {load}: {ratio:.2f} times the moves of {rival}"))
+    found.sort(key=lambda one: -one[0])
+    if not found:
+        return f"In no cell does a rival make fewer moves than {ours} by more than {SURE:g} standard errors."
+    head = f"Where we lose, {ours} against the best rival, by more than {SURE:g} standard errors:"
+    return "\n".join([head, "", *(line for _, line in found)])
+
+
+def by_cell(cells: Cells, methods: list[str]) -> str:
+    lines = [
+        f"Each plant and load at {RATIO:g} times plain MPC's error, in percent of its moves, with the standard error; "
+        "the fewest moves are in bold.",
         "",
         "| plant | load | " + " | ".join(methods) + " |",
         "|---|---|" + "---|" * len(methods),
     ]
-    for cell in cells:
-        values = [share(cell, method) for method in methods]
-        row = [cell["plant"], cell["load"]]
-        for method, value in zip(methods, values, strict=True):
-            if not np.isfinite(value):
-                row.append("not reached")
-                continue
-            error = cell[method][RATIO][1]
-            shown = f"{value:.1f}" + (f" ± {100 * error:.1f}" if np.isfinite(error) else "")
-            row.append(f"**{shown}**" if value == min(values) else shown)
+    for (plant, load), cell in cells.items():
+        least = min(cell[method][RATIO].value for method in methods if method in cell)
+        row = [plant, load]
+        for method in methods:
+            moves = cell[method][RATIO] if method in cell else None
+            text = "" if moves is None else str(moves)
+            row.append(f"**{text}**" if moves is not None and moves.value == least < np.inf else text)
         lines.append("| " + " | ".join(row) + " |")
     return "\n".join(lines)
 
 
-def draw(cells: list[dict], methods: list[str]) -> None:
-    """Ours against the best rival of each cell: below one is fewer moves."""
-    from mampc.loop.drawing import new_figure, styled
+def limits(cells: Cells) -> str:
+    """What no controller can have, beside ours."""
+    ours = next(name for name in OURS if any(name in cell for cell in cells.values()))
+    names = (ours, *LIMITS)
+    lines = [
+        f"The two limits at {RATIO:g} times plain MPC's error, in percent of its moves, in four scenarios.",
+        "",
+        "| plant | load | " + " | ".join(names) + " |",
+        "|---|---|" + "---|" * len(names),
+    ]
+    for (plant, load), cell in cells.items():
+        if any(name in cell for name in LIMITS):
+            row = [str(cell[name][RATIO]) if name in cell else "" for name in names]
+            lines.append("| " + " | ".join([plant, load, *row]) + " |")
+    return "\n".join(lines)
 
-    plants = list(dict.fromkeys(cell["plant"] for cell in cells))
-    kinds = list(dict.fromkeys(cell["load"] for cell in cells))
-    ratio = np.full((len(plants), len(kinds)), np.nan)
-    for cell in cells:
-        best = min(share(cell, method) for method in methods if method != OURS)
-        ratio[plants.index(cell["plant"]), kinds.index(cell["load"])] = share(cell, OURS) / best
+
+def draw(cells: Cells, methods: list[str]) -> None:
+    """Ours against the best rival of each cell: below one is fewer moves."""
+    from matplotlib.figure import Figure
+
+    from mampc.base.drawing import styled
+
+    plants = list(dict.fromkeys(plant for plant, _ in cells))
+    kinds = list(dict.fromkeys(load for _, load in cells))
+    shown = [name for name in OURS if name in methods]
     with styled():
-        figure, [[panel]] = new_figure(height=3.2)
-        image = np.log2(np.clip(ratio, 0.25, 4.0))
-        panel.imshow(image, cmap="RdYlGn_r", vmin=-2, vmax=2, aspect="auto")
-        for (i, j), value in np.ndenumerate(ratio):
-            text = "never" if not np.isfinite(value) else f"{value:.2f}"
-            panel.text(j, i, text, ha="center", va="center", fontsize=8)
-        panel.set_xticks(range(len(kinds)), kinds)
-        panel.set_yticks(range(len(plants)), plants)
-        panel.set_title(
-            "Moves of the exact price over those of the best rival, at 1.25 times plain MPC's error"
+        figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+        panels = figure.subplots(1, len(shown), squeeze=False, sharey=True)[0]
+        for panel, name in zip(panels, shown, strict=True):
+            ratio = np.full((len(plants), len(kinds)), np.nan)
+            for (plant, load), cell in cells.items():
+                if name in cell:
+                    value, _ = factor(cell[name][RATIO], best_rival(cell)[1])
+                    ratio[plants.index(plant), kinds.index(load)] = value
+            image = np.log2(np.clip(ratio, 0.25, 4.0))
+            panel.imshow(image, cmap="PuOr_r", vmin=-2, vmax=2, aspect="auto")
+            for (i, j), value in np.ndenumerate(ratio):
+                text = "" if np.isnan(value) else "never" if np.isinf(value) else f"{value:.2f}"
+                dark = abs(image[i, j]) > 1.4
+                panel.text(
+                    j, i, text, ha="center", va="center", fontsize=8, color="white" if dark else "black"
+                )
+            panel.set_xticks(range(len(kinds)), kinds, rotation=20)
+            panel.set_yticks(range(len(plants)), plants)
+            panel.tick_params(length=0)
+            panel.set_title(name, fontsize=9)
+            panel.grid(False)
+            for side in panel.spines.values():
+                side.set_visible(False)
+        figure.suptitle(
+            f"Moves over those of the best rival at {RATIO:g} times plain MPC's error: violet is fewer, orange is more",
+            fontsize=9,
         )
-        panel.grid(False)
         figure.savefig(DOCS / "images" / "attention.svg", metadata={"Date": None})
