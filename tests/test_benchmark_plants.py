@@ -43,6 +43,13 @@ def test_the_reactor_rests_where_its_source_says():
     np.testing.assert_allclose(REACTOR.derivative(REACTOR.steady_state(u), u), 0.0, atol=1e-12)
 
 
+def test_the_reactor_has_the_linear_model_that_its_source_prints():
+    model = mampc.linearise(REACTOR, [240 / 7])  # 4/7 of the volume a minute
+    minutes = 60.0  # from rates per second; the input is printed per minute, here it is per hour
+    np.testing.assert_allclose(model.A * minutes, [[-2.4048, 0.0], [0.8333, -2.2381]], atol=1e-4)
+    np.testing.assert_allclose(model.B[:, 0] * minutes * 60.0, [7.0, -1.117], atol=1e-3)
+
+
 def test_the_reactor_answers_the_wrong_way_first_below_its_maximum():
     rates = np.linspace(1, 200, 2000)[:, None]
     best = rates[REACTOR.steady_state(rates)[:, 1].argmax(), 0]

@@ -1,5 +1,6 @@
 """Rivals solve the problems that the literature states, and run like any controller."""
 
+from dataclasses import replace
 from itertools import product
 
 import cvxpy as cp
@@ -347,3 +348,23 @@ def test_a_steady_target_is_reached_whatever_the_states_units_are():
     np.testing.assert_allclose(target.y, reference, rtol=1e-6)
     u = target.u - model.u_op
     np.testing.assert_allclose(model.A @ target.x + model.B[:, :3] @ u, target.x, atol=1e-8)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e3])
+@pytest.mark.parametrize(
+    "plant", [mampc.plants.QuadrupleTank(), mampc.plants.wood_berry()], ids=["tank", "delays"]
+)
+def test_holds_are_decided_by_what_inputs_reach_whatever_the_estimator_and_the_states_units(plant, scale):
+    model = plant if isinstance(plant, mampc.StateSpace) else mampc.linearise(plant).discretise(10.0)
+    sizes = scale ** np.linspace(-1, 1, model.n_states)
+    model = replace(model, A=sizes[:, None] * model.A / sizes, B=sizes[:, None] * model.B, C=model.C / sizes)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=20, control_horizon=5, move_weight=0.1, limits=mampc.Limits(0.0, 100.0)
+    )
+    controller = mampc.rivals.SelfTriggered(mampc.MPC(problem))
+    reference = mampc.steps(60, model.y_op, [(5, model.y_op + 0.5)])
+    for estimator in (None, mampc.LoadBank(model, noise=0.01)) if scale == 1.0 else (None,):
+        regulator = mampc.Regulator(controller, estimator)
+        run = mampc.simulate(model, regulator, reference, noise=0.01, progress=False)
+        assert 0 < np.count_nonzero(np.diff(run.u, axis=0)) <= 12  # two inputs, a few holds
+        assert np.abs(run.y - run.r)[-10:].mean() < 0.25

@@ -111,6 +111,28 @@ def test_a_killed_sweep_loses_nothing_that_had_finished(tmp_path):
     assert (tmp_path / "out" / "sweep.csv").read_text().startswith("scenario,controller")
 
 
+def test_what_is_wrong_is_told_before_anything_runs(tmp_path):
+    with pytest.raises(mampc.MampcError, match="--jobs: expected -1"):
+        run_sweep(Sweep(small(), seeds=1, points=2), tmp_path / "a", jobs=0)
+    for size, message in (("big", "expected a number or one per signal"), ([1.0, 2.0, 3.0], "2 values")):
+        tables = [ControllerTable(name="x", method="dead_band", settings={"size": size})]
+        with pytest.raises(mampc.MampcError, match=message):
+            run_sweep(Sweep(small(controllers=tables), seeds=1, points=2), tmp_path / "b", jobs=1)
+    result = CliRunner().invoke(app, ["sweep", "quadruple-tank", "--table", "runs.xlsx"])
+    assert "expected a name that ends in .csv or .parquet" in str(result.exception) + result.output
+
+
+def test_whatever_answers_in_place_of_a_scheduler_is_told_in_one_sentence(swept, tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="needs the extra mampc[cluster]")
+
+    def answers(*arguments, **options):
+        raise MemoryError("3 EiB")
+
+    monkeypatch.setattr(distributed, "Client", answers)
+    with pytest.raises(mampc.MampcError, match=r"expected a Dask scheduler at .tcp"):
+        run_sweep(swept[0], tmp_path, scheduler="tcp://127.0.0.1:80")
+
+
 def test_results_of_another_study_are_refused(swept, tmp_path):
     _, folder, _ = swept
     (tmp_path / "sweep.jsonl").write_bytes((folder / "sweep.jsonl").read_bytes())
@@ -120,7 +142,7 @@ def test_results_of_another_study_are_refused(swept, tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_told_in_one_sentence(swept, tmp_path):
     pytest.importorskip("distributed", reason="needs the extra mampc[cluster]")
-    with pytest.raises(mampc.MampcError, match="expected a Dask scheduler at tcp"):
+    with pytest.raises(mampc.MampcError, match=r"expected a Dask scheduler at .tcp"):
         run_sweep(swept[0], tmp_path, scheduler="tcp://127.0.0.1:9")
 
 

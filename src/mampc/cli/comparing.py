@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, shown
 from mampc.cli.app import app
 from mampc.cli.console import bar, complain, console_for_tables
 
@@ -49,6 +49,8 @@ def sweep(
     """
     from mampc.report.fronts import write_rows
 
+    if Path(table).name != table or Path(table).suffix not in (".csv", ".parquet"):
+        raise MampcError(f"--table: expected a name that ends in .csv or .parquet, received {shown(table)}")
     _, rows, folder = _swept(study, out, seeds, points, jobs, scheduler, yes, trust)
     write_rows(rows, folder / table)
     console_for_tables().print(f"{len(rows)} runs are in {folder / table}", soft_wrap=True, markup=False)
@@ -125,13 +127,19 @@ def _swept(
     plan = Sweep(load_study(source, trust=True if trust else None), seeds, points)
     folder = Path("results") / f"{Path(source).stem}-sweep" if out is None else out
     if plan.runs > LARGE_SWEEP and not yes:
-        start = perf_counter()
-        run_task(Sweep(plan.study, 1, points), prepare(plan.study), plan.tasks[-1])
-        minutes = (perf_counter() - start) * plan.runs / 60 / 2
-        if not typer.confirm(
-            f"{plan.runs} runs may take {minutes:.0f} minutes on two cores. Go on?", err=True
-        ):
+        prepared, start = prepare(plan.study), perf_counter()
+        run_task(Sweep(plan.study, 1, points), prepared, plan.tasks[-1])
+        seconds = (perf_counter() - start) * plan.runs / 2
+        if not typer.confirm(f"{plan.runs} runs may take {_long(seconds)} on two cores. Go on?", err=True):
             raise typer.Exit(1)
     with bar(source) as show:
         rows = run_sweep(plan, folder, jobs=jobs, scheduler=scheduler, on_task=show)
     return plan, rows, folder
+
+
+def _long(seconds: float) -> str:
+    """A duration in words."""
+    for unit, size in (("years", 365 * 86400.0), ("days", 86400.0), ("hours", 3600.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{max(seconds / 60, 1):.0f} minutes"

@@ -26,24 +26,26 @@ class Journal:
 
     def __init__(self, path: Path, of: str) -> None:
         self._path, self.done = path, dict[str, list[dict[str, Any]]]()
-        if path.exists():
-            self._read(of)
+        if path.exists() and self._read(of):
             return
         try:
             path.write_text(json.dumps({"sweep": of}) + "\n", encoding="utf-8")
         except OSError as error:
             raise MampcError(f"--out: expected a folder that can be written, received: {error}") from None
 
-    def _read(self, of: str) -> None:
-        lines = self._lines()
-        first = next(lines, {})
+    def _read(self, of: str) -> bool:
+        """Take what is finished; whether the file is of this sweep. One of another is no loss where nothing is."""
+        first, *lines = list(self._lines()) or [{}]
         if first.get("sweep") != of:
+            if not lines and "sweep" in first:
+                return False
             raise MampcError(
                 f"{shown(str(self._path), 200)}: expected results of this study, seeds and points, received those of "
                 "another sweep; give another --out, or remove the file to begin anew"
             )
         for line in lines:
             self.done[line["task"]] = line["rows"]
+        return True
 
     def _lines(self) -> Iterator[dict[str, Any]]:
         """The lines that are whole; one that a killed sweep left half-written is not."""

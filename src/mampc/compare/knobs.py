@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mampc.base.errors import MampcError, shown
 from mampc.methods.registry import METHODS
 from mampc.study.schema import ControllerTable
 
@@ -37,6 +38,9 @@ def variants(table: ControllerTable, points: int) -> list[tuple[float, Controlle
     """A controller with values of its knob from a sixteenth of the study's own to sixteen times it.
 
     Whole numbers are rounded and come once; what has no knob comes as it is, with the value 1.
+
+    Raises:
+        MampcError: a knob that is no number.
     """
     place = knob_of(table)
     if place is None or points < 2:
@@ -52,7 +56,7 @@ def variants(table: ControllerTable, points: int) -> list[tuple[float, Controlle
         elif name == "overshoot":
             value = 1.0 + (usual - 1.0 if usual > 1 else 0.5) * factor
         else:
-            value = _scaled(usual, factor)
+            value = _scaled(f"controllers, {table.name!r}: {name}", usual, factor)
         key = tuple(value) if isinstance(value, list) else value
         if part == "rules":
             changed = {"rules": own.model_copy(update={name: value})}
@@ -65,7 +69,9 @@ def variants(table: ControllerTable, points: int) -> list[tuple[float, Controlle
     return list(found.values())
 
 
-def _scaled(value: Any, factor: float) -> Any:
+def _scaled(place: str, value: Any, factor: float) -> Any:
     if isinstance(value, list):
-        return [_scaled(entry, factor) for entry in value]
+        return [_scaled(place, entry, factor) for entry in value]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise MampcError(f"{place}: expected a number or one per signal, received {shown(value)}")
     return float(value) * factor

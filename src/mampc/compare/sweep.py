@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, shown
 from mampc.compare.fronts import Point
 from mampc.compare.journal import Journal
 from mampc.compare.knobs import variants
@@ -18,7 +18,7 @@ from mampc.study.running import Prepared, prepare, regulator_of, run_seeds
 from mampc.study.schema import ControllerTable, ScenarioTable, Study
 
 BASELINE = ControllerTable(name="MPC", method="mpc")
-SCHEDULER_SECONDS = 8  # that a cluster has to answer within
+SCHEDULER_SECONDS = 6  # that a cluster has to answer within
 
 
 @dataclass(frozen=True)
@@ -100,26 +100,34 @@ def run_sweep(
     Raises:
         MampcError: values that do not fit the study, results of another sweep, or a scheduler that is not there.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    if jobs == 0 or jobs < -1:
+        raise MampcError(f"--jobs: expected -1 for one a core, or a number of processes, received {jobs}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MampcError(f"--out: expected a folder that can be written, received: {error}") from None
     journal = Journal(folder / "sweep.jsonl", sweep.identity)
     tasks = sweep.tasks
     missing = [task for task in tasks if task.name not in journal.done]
     on_task(len(tasks) - len(missing), len(tasks))
     if missing:
+        cluster = None if scheduler is None else _cluster(scheduler)
         prepared = prepare(sweep.study, on_stage)
+        for task in {task.table.name: task for task in missing}.values():  # complain now rather than half-way
+            regulator_of(sweep.study, prepared.model, task.table)
         on_stage("running")
-        for number, (task, rows) in enumerate(_results(sweep, prepared, missing, jobs, scheduler), 1):
-            journal.add(task, rows)
+        for number, (name, rows) in enumerate(_results(sweep, prepared, missing, jobs, cluster), 1):
+            journal.add(name, rows)
             on_task(len(tasks) - len(missing) + number, len(tasks))
     return [row for task in tasks for row in journal.done[task.name]]
 
 
 def _results(
-    sweep: Sweep, prepared: Prepared, tasks: list[Task], jobs: int, scheduler: str | None
+    sweep: Sweep, prepared: Prepared, tasks: list[Task], jobs: int, cluster: Any
 ) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Each task's name and rows, as they finish."""
-    if scheduler is not None:
-        yield from _on_cluster(sweep, prepared, tasks, scheduler)
+    if cluster is not None:
+        yield from _on_cluster(sweep, prepared, tasks, cluster)
         return
     if jobs == 1 or len(tasks) == 1:
         for task in tasks:
@@ -131,18 +139,26 @@ def _results(
     yield from parallel(delayed(_named)(sweep, prepared, task) for task in tasks)
 
 
-def _on_cluster(
-    sweep: Sweep, prepared: Prepared, tasks: list[Task], address: str
-) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """The same on a Dask cluster, which gives the tasks of a lost worker to others."""
+def _cluster(address: str) -> Any:
+    """A client of a Dask cluster."""
     try:
-        from distributed import Client, as_completed
+        from distributed import Client
     except ImportError:
         raise MampcError("--scheduler: expected the extra mampc[cluster], received none installed") from None
     try:
-        client = Client(address, timeout=SCHEDULER_SECONDS)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise MampcError(f"--scheduler: expected a Dask scheduler at {address}, received: {error}") from None
+        return Client(address, timeout=SCHEDULER_SECONDS)
+    except Exception as error:  # whatever answers there, it is no scheduler
+        raise MampcError(
+            f"--scheduler: expected a Dask scheduler at {shown(address)}, received: {shown(str(error), 200)}"
+        ) from None
+
+
+def _on_cluster(
+    sweep: Sweep, prepared: Prepared, tasks: list[Task], client: Any
+) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """The same on a Dask cluster, which gives the tasks of a lost worker to others."""
+    from distributed import as_completed
+
     with client:
         shared = client.scatter((sweep, prepared), broadcast=True)
         futures = [client.submit(_shared, shared, task, pure=False, retries=3) for task in tasks]

@@ -4,6 +4,9 @@ Isothermal, of constant volume, with concentrations c and the dilution rate F / 
 
     dc_A/dt = F/V (c_feed - c_A) - k1 c_A - k3 c_A^2
     dc_B/dt = -F/V c_B + k1 c_A - k2 c_B
+
+At 4/7 per minute (34.3 per hour) it rests at 3 and 1.117 mol/l with the linear model that Bequette gives for it
+(Process Control: Modeling, Design, and Simulation, Prentice Hall 2003, chapter 16), which the tests compare with.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ constant input keeps a control Lyapunov function below its decay at every sample
 
     |P (x_{k+i} - x_s)|_inf <= beta rho^i |P (x_k - x_s)|_inf,    i = 1..h
 
-one linear program per h. P comes from the closed loop of the LQ law: the real eigenvectors of a stable matrix give an
+and without beta at i = h, since else an input under which nothing decays might be held again and again; one linear
+program per h. P comes from the closed loop of the LQ law: the real eigenvectors of a stable matrix give an
 infinity norm that decays along it. Where not even h = 1 can be kept, one step of MPC is made.
 """
 
@@ -21,11 +22,14 @@ from mampc.base.words import Status
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
 from mampc.methods.method import Plan
+from mampc.program.problem import TrackingProblem
 from mampc.program.sample import Sample
 from mampc.program.steady import SteadyTarget
 from mampc.rivals.rules import Rule
 
 NEAR = 1e-6  # of the state's size in P at a unit input: nearer to the target there is nothing left to decay
+UNREACHED = 1e-8  # of what an input of its size does to the mode that it moves the most: nothing
+LASTS = 1e-3  # share that a mode keeps from sample to sample; faster ones are dead times or as good as gone
 
 
 class SelfTriggered(Rule):
@@ -87,12 +91,15 @@ class SelfTriggered(Rule):
         reach = np.abs(self._forced).max()
         if size <= NEAR * max(reach, 1e-300):
             return self._longest, now
-        level = self._beta * size * self._rho ** np.arange(1, self._longest + 1)
-        drift = self._free @ error
+        end = size * self._rho ** np.arange(1, self._longest + 1)
+        level, drift = self._beta * end, self._free @ error
 
         def kept(v: Array) -> int:
-            within = (np.abs(drift + self._forced @ v) <= level[:, None]).all(axis=1)
-            return self._longest if within.all() else int(within.argmin())
+            largest = np.abs(drift + self._forced @ v).max(axis=1)
+            beyond = np.flatnonzero(largest > level)
+            within = beyond[0] if len(beyond) else len(level)
+            holds = np.flatnonzero(largest[:within] <= end[:within])
+            return int(holds[-1]) + 1 if len(holds) else 0
 
         best, chosen = kept(now), now
         if best == self._longest:
@@ -101,7 +108,7 @@ class SelfTriggered(Rule):
         found: Array | None = chosen if best else None
         while low < high:
             middle = (low + high + 1) // 2
-            v = self._program(drift[:middle], level[:middle], u_s)
+            v = self._program(drift[:middle], np.append(level[: middle - 1], end[middle - 1]), u_s)
             if v is None:
                 high = middle - 1
             else:
@@ -130,8 +137,12 @@ class SelfTriggered(Rule):
         return np.asarray(solution.x[:m])
 
 
-def _lyapunov_norm(problem: Any) -> tuple[Array, float]:
-    """P of an infinity norm |P x| that decays along the LQ law's closed loop, and its rate."""
+def _lyapunov_norm(problem: TrackingProblem) -> tuple[Array, float]:
+    """P of an infinity norm |P x| that decays along the LQ law's closed loop, and its rate.
+
+    One row a mode that inputs reach; what is left of the modes, such as a load that fades, no input decides. Rows are
+    in units of the LQ cost that a mode alone would have, the same whatever the units of states and signals.
+    """
     from scipy.linalg import solve_discrete_are
 
     model = problem.model
@@ -146,13 +157,32 @@ def _lyapunov_norm(problem: Any) -> tuple[Array, float]:
         ) from None
     closed = A - B @ np.linalg.solve(problem.move_weight + B.T @ S @ B, B.T @ S @ A)
     values, vectors = np.linalg.eig(closed)
+    unit = 1 / np.sqrt(np.diag(B.T @ S @ B) + np.diag(problem.move_weight))
+    left = _unreached(A, B * unit)
+    reached = np.abs(left @ vectors).max(axis=0, initial=0.0) <= UNREACHED * np.abs(left).max(initial=0.0)
+    slowest = float(np.abs(values[reached]).max(initial=0.0))
     # Complex pairs as their real and imaginary parts: their norm decays by |Re| + |Im| a sample.
     columns = [
         vectors[:, i].real if value.imag >= 0 else vectors[:, i].imag for i, value in enumerate(values)
     ]
     V = np.array(columns).T
-    if np.linalg.cond(V) > 1e10:  # a defective closed loop: the square root of its Lyapunov function instead
-        from mampc.program.tail import square_root
+    if np.linalg.cond(V) <= 1e10:
+        cost = np.sqrt(np.maximum(np.einsum("in,ij,jn->n", vectors.conj(), S, vectors).real, 0.0))
+        return (cost[:, None] * np.linalg.inv(V))[reached], slowest
+    # A defective closed loop: the square root of its Lyapunov function instead.
+    from mampc.program.tail import square_root
 
-        return square_root(S), float(np.abs(values).max())
-    return np.linalg.inv(V), float(np.abs(values).max())
+    own = vectors[:, ~reached]
+    if len(left) != own.shape[1]:
+        raise MampcError("SelfTriggered: expected a model whose inputs reach all of its lasting modes")
+    P = square_root(S) @ (np.eye(len(A)) - (own @ np.linalg.solve(left @ own, left)).real)
+    return P, slowest
+
+
+def _unreached(A: Array, B: Array) -> Array:
+    """Left eigenvectors of the lasting modes that inputs do not reach, one a row."""
+    values, vectors = np.linalg.eig(A.T)
+    reach = np.abs(vectors.T @ B).max(axis=1, initial=0.0)
+    unreached = (reach <= UNREACHED * reach.max(initial=0.0)) & (np.abs(values) > LASTS)
+    left: Array = vectors.T[unreached]
+    return left
