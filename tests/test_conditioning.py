@@ -12,6 +12,8 @@ from mampc import Status
 from mampc.base.words import Remark
 from mampc.methods.exact import ranking
 from mampc.program.condensing import CondensedQP
+from mampc.program.least_distance import LeastDistance, Nearest
+from mampc.program.qp import QPStatus
 from mampc.program.refinement import refined
 from referees import charge
 from seeds import seeds
@@ -127,3 +129,33 @@ def test_bounds_that_nothing_keeps_have_no_optimum():
     A = np.array([[1.0, 0.0], [1.0, 0.0]])
     low, high = np.array([1.0, -3.0]), np.array([2.0, -1.0])
     assert refined(np.eye(2), np.zeros(2), A, low, high, np.zeros(2), 50) is None
+
+
+@pytest.mark.parametrize("largest", [ranking.LARGEST_TABLE, 0], ids=["table", "tree"])
+@pytest.mark.parametrize("seed", [3, 8, 9, 13, 14, 19])
+def test_programs_without_an_answer_leave_a_gap_and_a_remark(seed, largest, monkeypatch):
+    """Plans that rounding leaves unproven are told of, and what bounds these is kept."""
+    monkeypatch.setattr(ranking, "LARGEST_TABLE", largest)
+    case = case_of(seed)
+    optimum = decided(case)
+    solve, asked = LeastDistance.solve, []
+
+    def now_and_then(self, *arguments):
+        asked.append(self)
+        nearest = solve(self, *arguments)
+        if nearest.iterations and len(asked) % 2:
+            return Nearest(None, np.inf, None, QPStatus.FAILED, nearest.iterations)
+        return nearest
+
+    monkeypatch.setattr(LeastDistance, "solve", now_and_then)
+    decision = decided(case)
+    if decision.held:
+        assert decision.status is not Status.OPTIMAL
+        return
+    assert decision.lower_bound <= optimum.objective * (1 + 1e-9)
+    if decision.status is Status.OPTIMAL:
+        assert decision.objective == pytest.approx(optimum.objective, rel=1e-7)
+    else:
+        assert Remark.ROUNDING in decision.remarks
+        assert decision.gap > 0
+        assert decision.lower_bound > 0

@@ -53,7 +53,8 @@ def doubted(plan: Plan, condensed: CondensedQP, sample: Sample) -> Plan:
     if doubt <= CERTAIN * objective:
         return plan
     status = Status.FEASIBLE if plan.status is Status.OPTIMAL else plan.status
-    return plan._replace(status=status, lower_bound=bound - doubt, remarks=(*plan.remarks, Remark.ROUNDING))
+    remarks = tuple(remark for remark in plan.remarks if remark is not Remark.ROUNDING)
+    return plan._replace(status=status, lower_bound=bound - doubt, remarks=(*remarks, Remark.ROUNDING))
 
 
 class Search(Protocol):

@@ -41,9 +41,12 @@ class OnPattern(NamedTuple):
 
 
 class Incumbent:
-    """The best plan found so far, and the work it took."""
+    """The best plan found so far, and the work it took.
 
-    __slots__ = ("failure", "moves", "multipliers", "objective", "solved")
+    `failure` says how a pattern was left without an answer, if any was; `unproven` bounds what such patterns cost.
+    """
+
+    __slots__ = ("failure", "moves", "multipliers", "objective", "solved", "unproven")
 
     def __init__(self) -> None:
         self.moves: Array | None = None
@@ -51,17 +54,22 @@ class Incumbent:
         self.multipliers: Array | None = None
         self.solved = 0
         self.failure: QPStatus | None = None
+        self.unproven = np.inf
 
-    def offer(self, on_pattern: OnPattern) -> bool:
-        """Take the moves of a pattern if they are better; says whether they were."""
+    def offer(self, on_pattern: OnPattern, bound: float = -np.inf) -> bool:
+        """Take the moves of a pattern if they are better; says whether they were. `bound`: on their objective."""
         self.solved += 1
         if on_pattern.status not in (QPStatus.OPTIMAL, QPStatus.INFEASIBLE, QPStatus.TIME_LIMIT):
-            self.failure = on_pattern.status
+            self.left(on_pattern.status, max(bound, on_pattern.objective))
         if on_pattern.moves is None or on_pattern.objective >= self.objective:
             return False
         self.moves, self.objective = on_pattern.moves, on_pattern.objective
         self.multipliers = on_pattern.multipliers
         return True
+
+    def left(self, status: QPStatus, bound: float) -> None:
+        """Plans that cost at least `bound` stay unproven, for a program that ended like this."""
+        self.failure, self.unproven = status, min(self.unproven, bound)
 
 
 class PatternSolver:
@@ -190,7 +198,7 @@ class PatternSolver:
         nearest = restriction.solve(optimum, lower, upper)
         if nearest.moves is None or base + nearest.excess >= cutoff:
             failed = nearest.moves is None and nearest.status not in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA)
-            bound = -np.inf if failed else base + nearest.excess
+            bound = base if failed else base + nearest.excess
             return OnPattern(None, bound, nearest.status, nearest.multipliers, nearest.iterations)
         if self._levels is not None:
             return self._on_levels(sample, pattern, optimum, bounds, nearest.multipliers, cutoff, deadline)
@@ -204,9 +212,8 @@ class PatternSolver:
             cutoff=cutoff - base, most=self._most_programs, deadline=deadline,
         )  # fmt: skip
         if signed.moves is None:
-            return OnPattern(
-                None, base + signed.excess, signed.status, nearest.multipliers, signed.iterations
-            )
+            excess = max(signed.excess, nearest.excess)  # that without least sizes where a program failed
+            return OnPattern(None, base + excess, signed.status, nearest.multipliers, signed.iterations)
         answer = self._answer(
             sample,
             pattern,

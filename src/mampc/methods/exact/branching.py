@@ -22,6 +22,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.exact.zone_curvature import ZoneCurvature
+from mampc.program.qp import QPStatus
 from mampc.program.sample import Indices
 
 UNDECIDED, OUT, MADE = 0, 1, 2
@@ -61,7 +62,7 @@ class Branching:
         zoned = squares.condensed.bounds.zones is not None
         self._zones = ZoneCurvature(squares.condensed, squares.normal, order, sample) if zoned else None
         self._tried: set[bytes] = set()
-        self._failed = False  # whether a program had no answer
+        self._failed: QPStatus | None = None  # how a program without an answer ended
 
     def run(self) -> float:
         """A lower bound over everything that was not visited: infinite when the search is complete."""
@@ -83,8 +84,11 @@ class Branching:
             for child_bound, child in self._children(state, Z):
                 number += 1
                 heappush(heap, (child_bound, number, child, Z))
-            if self._failed:  # what this node leads to stays unproven
+            if self._failed is QPStatus.TIME_LIMIT:
                 return bound
+            if self._failed is not None:  # what this node leads to stays unproven
+                problem.best.left(self._failed, bound)
+                self._failed = None
         return np.inf
 
     def _children(self, state: Indices, Z: Array) -> list[tuple[float, Indices]]:
@@ -161,7 +165,7 @@ class Branching:
         up, down = np.where(slope, domain.up, 0.0), np.where(slope, domain.down, 0.0)
         found = self._problem.relaxation.solve_priced(low, high, up, down)
         if not found.solved:
-            self._failed = not found.infeasible
+            self._failed = None if found.infeasible else found.status
             return None
         d = found.moves
         s = np.where(domain.bounded | ~within, found.pulls, 0.0)

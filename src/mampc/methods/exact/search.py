@@ -110,7 +110,8 @@ class ExactSearch:
         """The best moves of all admissible patterns for one sample."""
         past, solver = self.admissible.allowance(inputs, sample.frozen), self._solver.after(inputs)
         if past.exceeded:
-            return self._search(sample, past, solver)._replace(remarks=(Remark.BUDGET_EXCEEDED,))
+            plan = self._search(sample, past, solver)
+            return plan._replace(remarks=(Remark.BUDGET_EXCEEDED, *plan.remarks))
         return self._search(sample, past, solver)
 
     def _search(self, sample: Sample, past: Allowance, solver: PatternSolver) -> Plan:
@@ -181,7 +182,7 @@ class ExactSearch:
             if perf_counter() > deadline:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
             solved = solver.solve(sample, ranking.patterns[open_.rows[at]], best.objective, deadline)
-            best.offer(solved)
+            best.offer(solved, bound)
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
             open_.close(at)
@@ -204,8 +205,10 @@ class ExactSearch:
         return self._plan(sample, best, best.objective)
 
     def _plan(self, sample: Sample, best: Incumbent, bound: float, status: Status = Status.OPTIMAL) -> Plan:
-        if best.failure is not None:  # a pattern without an answer leaves the rest unproven
-            bound, status = -np.inf, Status.FEASIBLE
+        remarks: tuple[Remark, ...] = ()
+        if best.failure is not None and best.unproven < best.objective:
+            bound, remarks = min(bound, best.unproven), (Remark.ROUNDING,)
+            status = Status.FEASIBLE if status is Status.OPTIMAL else status
         if best.moves is None:
             if status is Status.OPTIMAL:
                 return Plan(None, Status.HELD_INFEASIBLE, best.solved)
@@ -214,9 +217,9 @@ class ExactSearch:
             hold = np.zeros(self.condensed.n_moves)
             if sample.bounds_now is not None and sample.bounds_now.on(hold != 0) is None:
                 return Plan(None, Status.HELD_INFEASIBLE, best.solved)
-            return Plan(hold, status, best.solved, bound)
+            return Plan(hold, status, best.solved, bound, remarks=remarks)
         lower = None if status is Status.OPTIMAL else min(bound, best.objective)
-        return Plan(best.moves, status, best.solved, lower, None, None, best.objective)
+        return Plan(best.moves, status, best.solved, lower, None, None, best.objective, remarks)
 
 
 def _priced(condensed: CondensedQP, sample: Sample, multipliers: Array | None) -> LeastSquares | None:
