@@ -19,7 +19,6 @@ import json
 import platform
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,102 +26,17 @@ import numpy as np
 from joblib import Parallel, delayed
 
 import mampc
+from attention_cases import LOADS, STEPS, Case, cases, load_of, per_input, problem_of, reference_of
 from attention_limits import SCENARIOS, limit
-from mampc import loads, rivals
+from mampc import rivals
 from mampc.compare.fronts import Point, moves_at
 from mampc.compare.journal import Journal
 
 RESULTS = Path(__file__).parent / "results"
 TUNING, EVALUATION = range(1000, 1004), range(8)  # seeds
-STEPS = 200
 KNOB = np.geomspace(1 / 30, 30, 6)  # of the tuning, in units of noise
 ABOUT = np.geomspace(1 / 6, 6, 9)  # of the evaluation, about the knob that was found
 RATIO = 1.25  # of errors, that methods are tuned for
-LOADS = ("none", "steps", "wandering", "coloured", "sinusoidal")
-
-
-@dataclass(frozen=True)
-class Case:
-    """A plant, the model that controllers have of it, and its usual noise and set-point changes, in output units."""
-
-    plant: object
-    model: mampc.StateSpace
-    noise: np.ndarray
-    changes: np.ndarray
-    limits: mampc.Limits
-    horizon: int
-
-
-def cases() -> dict[str, Case]:
-    """The plants by name, in the order of the tables."""
-    tank, leaky = mampc.plants.QuadrupleTank(), Leaky()
-    cell, reactor, level = mampc.plants.SolidOxideFuelCell(), mampc.plants.VanDeVusse(), mampc.plants.Level()
-    column, third = mampc.plants.wood_berry(), mampc.plants.ogunnaike_ray()
-    off = mampc.Mismatch(gain=0.1, lag=0.1)
-
-    def case(plant, model, noise, changes, low, high, horizon):
-        return Case(
-            plant, model, np.array(noise), np.array(changes), mampc.Limits(u_min=low, u_max=high), horizon
-        )
-
-    tank_model = mampc.linearise(tank).discretise(10.0)
-    return {
-        "tank": case(tank, tank_model, [0.1, 0.1], [2.0, 2.0], 0.0, 100.0, 15),
-        "tank with leak": case(leaky, tank_model, [0.1, 0.1], [2.0, 2.0], 0.0, 100.0, 15),
-        "fuel cell": case(
-            cell, mampc.linearise(cell).discretise(0.5), [0.2], [4.0], [80.0, 50.0], [120.0, 150.0], 15
-        ),
-        "Wood-Berry": case(column, column, [0.05, 0.05], [0.5, 0.5], 0.0, [3.9, 3.42], 30),
-        "van de Vusse": case(reactor, mampc.linearise(reactor).discretise(7.2), [0.005], [0.05], 0.0, 70.0, 20),
-        "level": case(
-            mampc.plants.Level(capacity=0.115), mampc.linearise(level).discretise(10.0), [0.01], [0.1], 0.0, 100.0, 30
-        ),
-        "3 x 3 column": case(
-            off.drawn(third, 1), third, [0.001, 0.001, 0.1], [0.01, 0.01, 1.0], 0.0, [0.36, 0.092, 40.0], 40
-        ),
-    }  # fmt: skip
-
-
-class Leaky(mampc.plants.QuadrupleTank):
-    """The tank with a leak in its first lower tank, which the model does not know."""
-
-    def derivative(self, x, u):
-        rates = np.array(super().derivative(x, u), dtype=float)
-        rates[..., 0] -= 0.004 * np.sqrt(np.maximum(np.asarray(x)[..., 0], 0.0))
-        return rates
-
-
-def per_input(case: Case) -> np.ndarray:
-    """The input change that moves the outputs by their noise, over the horizon, shape (m,)."""
-    response = case.model.step_response(case.horizon + 1)[-1][:, : case.model.n_inputs]
-    return 1 / np.sqrt(np.mean((response / case.noise[:, None]) ** 2, axis=0))
-
-
-def load_of(kind: str, case: Case) -> tuple:
-    unit, dt = per_input(case), case.model.dt
-    return {
-        "none": (),
-        "steps": (loads.RandomSteps(size=tuple(8 * unit), every=60 * dt),),
-        "wandering": (loads.RandomWalk(size=tuple(0.4 * unit)),),
-        "coloured": (loads.Coloured(size=tuple(3 * unit), time_constant=10 * dt),),
-        "sinusoidal": (loads.Sinusoid(size=tuple(6 * unit), period=100 * dt, phase=None),),
-    }[kind]
-
-
-def reference_of(case: Case) -> np.ndarray:
-    y = case.model.y_op
-    return mampc.steps(STEPS, y, [(20, y + case.changes), (110, y)])
-
-
-def problem_of(
-    case: Case, *, lighter: float = 1.0, tail: float = 0.0, moves: int = 5
-) -> mampc.TrackingProblem:
-    """Weights in units of the noise; moves weigh a tenth of what they do to the outputs."""
-    weight = 0.1 * lighter / per_input(case) ** 2
-    return mampc.TrackingProblem(
-        case.model, prediction_horizon=case.horizon, control_horizon=moves, output_weight=1 / case.noise**2,
-        move_weight=weight, limits=case.limits, tail_horizon=tail,
-    )  # fmt: skip
 
 
 def estimator_of(case: Case, drift: float | str) -> Any:

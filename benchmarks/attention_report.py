@@ -227,7 +227,7 @@ def draw(cells: Cells, methods: list[str]) -> None:
             panel.imshow(image, cmap="PuOr_r", vmin=-2, vmax=2, aspect="auto")
             for (i, j), value in np.ndenumerate(ratio):
                 text = "" if np.isnan(value) else "never" if np.isinf(value) else f"{value:.2f}"
-                dark = abs(image[i, j]) > 1.4
+                dark = not -1.0 < image[i, j] < 1.6
                 panel.text(
                     j, i, text, ha="center", va="center", fontsize=8, color="white" if dark else "black"
                 )
