@@ -593,3 +593,23 @@ def test_plain_records_are_read_without_a_warning_and_without_pandas(tmp_path):
         "sys.exit('pandas' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M:%S.%f"])
+def test_plain_stamps_need_no_pandas_and_say_what_others_say(tmp_path, form):
+    path = write(tmp_path, text(rows(stamps(form=form))))
+    code = (
+        f"import sys, mampc; record = mampc.IOData.from_csv({str(path)!r}, inputs='u', outputs='y'); "
+        "sys.exit('pandas' in sys.modules or record.dt != 60.0)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+    assert_whole(read_export(path, inputs="u", outputs="y", time_format=form))
+
+
+@pytest.mark.parametrize("wrong", ["2024-02-30 10:00:00", "2024-04-13 25:00:00", "", "Total"])
+def test_a_stamp_that_is_none_is_left_out_and_told(tmp_path, wrong):
+    times = stamps()
+    times[11] = wrong
+    export = read(tmp_path, text(rows(times)))
+    assert [len(record) for record in export.records] == [11]
+    assert told(export, "no time can be read in row 13")

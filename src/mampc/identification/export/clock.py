@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,10 @@ from mampc.identification.export.stamps import (
     DATE_ONLY,
     SECONDS,
     TimeReading,
+    clock_put_back,
     from_stamps,
     iso_stamps,
+    plain_stamps,
     since_first,
 )
 
@@ -42,7 +45,7 @@ class Clock:
         name: of the column, or of both.
         columns: their positions.
         seconds: after `origin`, not-a-number where it cannot be read; shape (N,).
-        origin: the moment that counts as zero, as a pandas Timestamp; None where the column holds numbers.
+        origin: the moment that counts as zero, a `datetime`; None where the column holds numbers.
         zone: behind moments as messages show them.
     """
 
@@ -56,9 +59,7 @@ class Clock:
         """A moment as messages show it."""
         if self.origin is None:
             return f"{second:.10g} s"
-        import pandas as pd
-
-        moment = self.origin + pd.Timedelta(seconds=round(second, 6))
+        moment = self.origin + timedelta(seconds=round(second, 6))
         return f"{moment.isoformat(sep=' ')}{self.zone}"
 
 
@@ -75,8 +76,14 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     if not columns:
         return None
     name = " and ".join(sheet.header[at] for at in columns)
+    seconds: Array
+    origin: Any
+    told = how.time_format is not None or how.time_zone is not None
     if len(columns) == 1 and how.time_format is None and numeric_share(_sampled(sheet, columns[0])) > 0.5:
         seconds, origin = _from_numbers(sheet, columns[0], how, findings), None
+    elif len(columns) == 1 and not told and (plain := plain_stamps(sheet.chunks(columns))) is not None:
+        seconds = clock_put_back(*plain, sheet, findings)
+        origin = plain[1]
     elif (
         len(columns) == 1
         and how.time_format is None

@@ -189,11 +189,12 @@ def _in_order(clock: Clock, numbers: npt.NDArray[np.int64], findings: Findings) 
         findings.change("rows run backwards in time; put in order")
         return known[::-1]
     late = np.flatnonzero(steps < 0)
-    if len(late):
-        findings.change(
-            f"rows are not in the order of time, first in row {numbers[known[late[0] + 1]]} ({len(late)} steps back); "
-            "put in order"
-        )
+    if not len(late):
+        return known
+    findings.change(
+        f"rows are not in the order of time, first in row {numbers[known[late[0] + 1]]} ({len(late)} steps back); "
+        "put in order"
+    )
     return known[np.argsort(seconds, kind="stable")]
 
 

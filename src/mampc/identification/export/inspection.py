@@ -116,12 +116,11 @@ def inspect_export(
     ]
     positions = dict(zip(wanted, taken, strict=True)) or _numeric(sheet, free)
     others = tuple(sheet.header[at] for at in free if at not in positions.values()) if not wanted else ()
-    columns = read_numbers(sheet, positions, reading, findings)
+    columns, values = read_numbers(sheet, positions, reading, findings)
     drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
     for column in columns:
         if column.marks:
             findings.note(str(column))
-    values = np.column_stack([column.values for column in columns]) if columns else np.empty((len(sheet), 0))
     grid = make_grid(clock, values, sheet.numbers, dt, findings)
     order, seconds = (np.arange(len(values)), np.arange(len(values)) * 1.0)
     lengths: tuple[int, ...] = (len(values),)

@@ -96,19 +96,26 @@ class Column:
 
 def read_numbers(
     sheet: Sheet, columns: Mapping[str, int], reading: Reading, findings: Findings
-) -> list[Column]:
-    """The columns, by name and position, as numbers; cells that may or may not be numbers become doubts."""
+) -> tuple[list[Column], Array]:
+    """The columns, by name and position, as numbers; cells that may or may not be numbers become doubts.
+
+    Their values are the columns of one array, shape (N, columns), which is returned beside them.
+    """
     doubts = len(findings.doubts)
     decimal = reading.decimal or _decimal_mark(sheet, list(columns.values()), findings)
     grouped = reading.decimal is not None or len(findings.doubts) > doubts
-    readers = [_Reader(name, len(sheet), decimal, grouped, reading) for name in columns]
+    values = np.full((len(sheet), len(columns)), np.nan)
+    readers = [
+        _Reader(Column(name, own), decimal, grouped, reading)
+        for name, own in zip(columns, values.T, strict=True)
+    ]
     start = 0
     for part in sheet.chunks(list(columns.values())):
         rows = sheet.numbers[start : start + len(part[0])]
         for reader, cells in zip(readers, part, strict=True):
             reader.read(start, cells, rows)
         start += len(rows)
-    return [reader.finish(sheet.numbers, findings) for reader in readers]
+    return [reader.finish(sheet.numbers, findings) for reader in readers], values
 
 
 def clean(cell: str) -> str:
@@ -119,8 +126,8 @@ def clean(cell: str) -> str:
 class _Reader:
     """Reads one column chunk by chunk."""
 
-    def __init__(self, name: str, size: int, decimal: str, grouped: bool, reading: Reading) -> None:
-        self.column = Column(name, np.full(size, np.nan))
+    def __init__(self, column: Column, decimal: str, grouped: bool, reading: Reading) -> None:
+        self.column = column
         self.reading = reading
         self.decimal = decimal
         self.unclear: dict[str, list[int]] = {}

@@ -145,12 +145,11 @@ def _read_table(
     units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
     quality = tuple(quality_columns(sheet.header, positions))
     clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
-    columns = read_numbers(sheet, positions, reading, findings)
+    columns, values = read_numbers(sheet, positions, reading, findings)
     drop_bad_quality(sheet, columns, positions, good, findings)
     for column in columns:
         if column.marks:
             findings.change(str(column))
-    values = np.column_stack([column.values for column in columns])
     return _Table(replace(names, units=units), clock, values, sheet.numbers)
 
 

@@ -278,7 +278,7 @@ def _measured(
             ]
             yield [[row[at].strip() for row in part] for at in columns]
 
-    return Sheet(header, units, np.array(numbers, dtype=np.int64), chunks, separator, sample)
+    return Sheet(header, units, np.frombuffer(numbers, dtype=np.int64), chunks, separator, sample)
 
 
 def _from(rows: Rows, header_number: int) -> Iterator[list[Row]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from itertools import product
 from typing import Any
 
@@ -35,6 +36,7 @@ MONTH_FIRST = (
     "%m/%d/%Y", "%m-%d-%Y", "%m/%d/%y", "%m-%d-%y", "%b %d, %Y", "%b %d %Y", "%B %d, %Y",
 )  # fmt: skip
 YEAR_FIRST = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d")
+PLAIN = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d{1,6})?)?", re.ASCII)
 UTC = re.compile(r" ?(UTC|GMT)$")
 HOUR = 3600.0
 
@@ -67,6 +69,26 @@ class TimeReading:
                 raise MampcError(
                     f"time_zone: expected a name such as 'Europe/Berlin', received {shown(self.time_zone)}"
                 ) from None
+
+
+def plain_stamps(blocks: Iterable[Sequence[Cells]]) -> tuple[Array, datetime] | None:
+    """Seconds after the first of local stamps in ISO's form, all complete, and that stamp; numpy reads these alone.
+
+    Block by block: the words of a long file are never all there. None where any cell is something else.
+    """
+    parts: list[Any] = []
+    for [cells] in blocks:
+        if not isinstance(cells, list) or not all(map(PLAIN.fullmatch, cells)):
+            return None
+        try:
+            parts.append(np.array(cells, dtype="datetime64[us]").view(np.int64))
+        except ValueError:  # such as a 30th of February
+            return None
+    ticks = np.concatenate(parts)
+    first = int(ticks.min())
+    ticks -= first
+    seconds: Array = ticks / 1e6
+    return seconds, datetime(1970, 1, 1) + timedelta(microseconds=first)
 
 
 def iso_stamps(blocks: Iterable[Sequence[Cells]]) -> Any:
@@ -205,7 +227,7 @@ def since_first(stamps: Any, how: TimeReading, sheet: Sheet, findings: Findings)
     origin = stamps.min()
     seconds = (stamps - origin).dt.total_seconds().to_numpy(dtype=np.float64)
     if origin.tzinfo is None:
-        return _clock_put_back(seconds, origin, sheet, findings), origin
+        return clock_put_back(seconds, origin, sheet, findings), origin
     return seconds, origin.tz_convert("UTC")
 
 
@@ -223,7 +245,7 @@ def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
     return read.reindex(stamps.index)
 
 
-def _clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Findings) -> Array:
+def clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Findings) -> Array:
     """Local time in the order of rows, with an hour added where the clock was put back an hour."""
     known = np.flatnonzero(~np.isnan(seconds))
     steps = np.diff(seconds[known])
@@ -235,11 +257,9 @@ def _clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Finding
     back = np.flatnonzero((np.abs(steps - (usual - HOUR)) <= 0.3 * usual) & (steps <= 0))
     if not 0 < len(back) <= 3 or (steps[np.setdiff1d(np.arange(len(steps)), back)] <= 0).mean() > 0.001:
         return seconds
-    import pandas as pd
-
     corrected = seconds.copy()
     for i in back:
-        moment = origin + pd.Timedelta(seconds=float(seconds[known[i]]))
+        moment = origin + timedelta(seconds=float(seconds[known[i]]))
         if usual >= HOUR and not (moment.weekday() == 6 and moment.hour <= 3):
             continue
         if usual >= HOUR and _same_cells(sheet, int(known[i]), int(known[i + 1])):
