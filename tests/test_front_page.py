@@ -3,9 +3,10 @@
 import json
 import re
 
+import numpy as np
 import pytest
 
-from mampc.compare.fronts import error_ratio
+from mampc.compare.fronts import Point, error_ratio
 from mampc.compare.sweep import Sweep, points_of, run_sweep
 from mampc.study import parse_study, template
 
@@ -86,6 +87,15 @@ def test_a_method_that_never_reaches_the_error_is_told_in_words(rows, page):
     assert all(error_ratio(point, baseline) > front_page.WIDEST for point in points["never"])
     assert "In noisy, no setting of never comes within 2.5 times the error of plain MPC." in page
     assert not any(choice["group"] == "never" for s in content(page)["scenarios"] for choice in s["choices"])
+
+
+def test_a_long_front_is_shown_in_part_with_both_ends():
+    baseline = Point("MPC", 1.0, np.full(3, 100.0), np.ones(3))
+    points = [Point("x", v, np.full(3, 90.0 - v), np.full(3, 1 + v / 100)) for v in range(80)]
+    shown = front_page.worth_showing(points, baseline)
+    assert len(shown) == front_page.MOST_SETTINGS
+    assert shown[0] is points[0]
+    assert shown[-1] is points[-1]
 
 
 @pytest.mark.parametrize("width", [1280, 390])

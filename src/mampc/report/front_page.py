@@ -24,6 +24,7 @@ from mampc.study.schema import ControllerTable
 
 Rows = list[dict[str, Any]]
 PAGE = "report.html"
+MOST_SETTINGS = 12  # of a method in a scenario, evenly along its front
 
 
 def write_front_page(
@@ -58,6 +59,8 @@ def front_page(
             for point in shown:
                 task = tasks[scenario.name, name, point.value]
                 named = setting_name(task.table, point.value)
+                if any(named == other and task.scenario is before.scenario for before, other, _ in chosen):
+                    named = setting_name(task.table, point.value, digits=8)
                 group[named] = name
                 chosen.append((task, named, point))
                 if name == best and allowed and point is min(allowed, key=lambda p: float(p.moves.mean())):
@@ -83,13 +86,15 @@ def front_page(
 
 
 def worth_showing(points: list[Point], baseline: Point) -> list[Point]:
-    """The front of a method, as far as its errors are not far beyond that of plain MPC."""
+    """The front of a method, as far as its errors are not far beyond that of plain MPC; some of it where it is long."""
     moves, errors = np.array([p.moves.mean() for p in points]), np.array([p.error.mean() for p in points])
     front = [points[i] for i in non_dominated(moves, errors).tolist()]
-    return [point for point in front if error_ratio(point, baseline) <= WIDEST]
+    front = [point for point in front if error_ratio(point, baseline) <= WIDEST]
+    places = np.linspace(0, len(front) - 1, min(len(front), MOST_SETTINGS)).round().astype(int)
+    return [front[place] for place in places.tolist()]
 
 
-def setting_name(table: ControllerTable, value: float) -> str:
+def setting_name(table: ControllerTable, value: float, digits: int = 3) -> str:
     """A controller with its knob, such as "dead-band, size 0.5"."""
     place = knob_of(table)
     if place is None:
@@ -98,6 +103,6 @@ def setting_name(table: ControllerTable, value: float) -> str:
     own = getattr(table, part)
     own = getattr(own, name) if part == "rules" else own.get(name, value)
     if isinstance(own, list | tuple):
-        own = ", ".join(f"{entry:.3g}" for entry in np.ravel(own))
+        own = ", ".join(f"{entry:.{digits}g}" for entry in np.ravel(own))
         return f"{table.name}, {name} ({own})"
-    return f"{table.name}, {name} {own:.3g}"
+    return f"{table.name}, {name} {own:.{digits}g}"
