@@ -93,10 +93,13 @@ def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, outp
     weighed = changes if problem.weigh_first_move else changes[1:]
     excess = np.maximum(0.0, np.maximum(y - limits.y_max, limits.y_min - y))[1:]
     scaled = violation_scale(problem) * (excess / fading(n_p)[:, None]).max(axis=0)
+    ranked = problem.output_weight * np.sqrt(
+        np.outer(*[np.where(problem.zoned, problem.rank_weights, 1.0)] * 2)
+    )
     return (
-        np.einsum("ia,ab,ib", error, problem.output_weight, error)
+        np.einsum("ia,ab,ib", error, ranked, error)
         + np.einsum("ja,ab,jb", weighed, problem.move_weight, weighed)
-        + problem.output_limit_weight * np.sum(scaled + scaled**2 / 2)
+        + np.sum(problem.output_limit_weights * (scaled + scaled**2 / 2))
         + cost_of_inputs(problem, plan[np.minimum(np.arange(n_p + 1), len(plan) - 1)])
     )
 

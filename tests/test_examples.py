@@ -70,3 +70,15 @@ def test_an_on_off_heater_keeps_its_times_and_starts(found):
         assert set(runs[name].u.ravel().tolist()) == {0.0, 1.0}
         assert runs[name].y[80:120].mean() == pytest.approx(22.0, abs=0.5)
     assert set(runs["quarters"].u.ravel().tolist()) <= {0.0, 0.25, 0.5, 0.75, 1.0}
+
+
+def test_the_more_important_level_stays_within_its_limit():
+    text = (EXAMPLES / "ranks.toml").read_text()
+    unranked = text.replace("output_rank = [2, 1]", "")
+    assert unranked != text
+    for study, kept in ((text, True), (unranked, False)):
+        path = load_study(EXAMPLES / "ranks.toml").place
+        runs = run_study(parse_study(study).model_copy(update={"place": path})).runs["noise-free"]
+        for run in runs.values():
+            assert run.y[-1, 0] < 22.0
+            assert (run.y[-1, 1] <= 41.0) == kept

@@ -62,8 +62,8 @@ class Bounds:
         n_zones = 0 if self.zones is None else len(self.zones.root)
         self.n_violations = v = v_limited + n_zones
         self.violation_cost = ViolationCost(
-            np.repeat([problem.output_limit_weight, 0.0], [v_limited, n_zones]),
-            np.repeat([problem.output_limit_weight, 2.0], [v_limited, n_zones]),
+            np.concatenate([problem.output_limit_weights[limited], np.zeros(n_zones)]),
+            np.concatenate([problem.output_limit_weights[limited], np.full(n_zones, 2.0)]),
         )
         n_simple = self.n_simple = v + (n if self.every_move else m)
         inputs = np.flatnonzero(np.tile(np.isfinite(limits.u_min) | np.isfinite(limits.u_max), n_c))

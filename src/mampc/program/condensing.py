@@ -82,6 +82,7 @@ class CondensedQP:
         self, problem: TrackingProblem, *, bound_every_move: bool = False, time_limit: float | None = None
     ) -> None:
         self.problem, self._time_limit = problem, time_limit
+        self._limit_weights = problem.output_limit_weights
         n_c, m = problem.control_horizon, problem.model.n_inputs
         n = self.n_moves = n_c * m
         self.cumulate = np.kron(np.tri(n_c), np.eye(m))
@@ -234,7 +235,7 @@ class CondensedQP:
         cost = sample.cost + missed.dot(missed)
         if self.n_violations:
             scaled = self.bounds.violation_scale * self.violations(sample, moves, faded=True)
-            cost += self.problem.output_limit_weight * (scaled.sum() + 0.5 * (scaled @ scaled))
+            cost += (scaled + 0.5 * scaled * scaled).dot(self._limit_weights)
             if self.bounds.zones is not None:
                 errors = self.bounds.zone_errors(moves, sample.lower, sample.upper)
                 cost += errors.dot(errors)

@@ -13,6 +13,8 @@ from mampc.systems.state_space import StateSpace
 
 MOST_PREDICTIONS = 5000  # future values of all outputs together; their weights take the square of it
 MOST_MOVES = 1000  # future moves of all inputs together
+LARGEST_LIMIT_WEIGHT = 1e8
+RANK_RATIO = 100.0  # of the weights of two ranks that follow each other
 LONGEST_HORIZON = 2000  # samples; a condensed problem beyond it is a mistake rather than a wish
 
 
@@ -98,6 +100,8 @@ class TrackingProblem:
         limits: input, move and output limits, in engineering units.
         weigh_first_move: False leaves du_0 without weight, as the paper prints it (sum from j = 1).
         output_limit_weight: w, up to 1e8: how many times tracking a violation counts.
+        output_rank: whole numbers, one per output, 1 for the most important one; default the same for all. Limits and
+            zones of each rank weigh `RANK_RATIO` = 100 times what those of the next one weigh, the last one as said.
         tail_horizon: L >= 0, in samples. Beyond the prediction horizon, inputs held, errors go on to count,
             weighted gamma, gamma^2, ... with gamma = L / (1 + L), so that an error that stays costs L
             samples more. With prices it decides how long an offset is looked at (see docs/methods.md).
@@ -130,6 +134,7 @@ class TrackingProblem:
     u_cost: Any = field(default=0.0, kw_only=True)
     zone_below: Any = field(default=0.0, kw_only=True)
     zone_above: Any = field(default=0.0, kw_only=True)
+    output_rank: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, StateSpace):
@@ -147,8 +152,10 @@ class TrackingProblem:
         if not isinstance(self.limits, Limits):
             raise MampcError(f"limits: expected mampc.Limits, received {type(self.limits).__name__}")
         weight = as_number("output_limit_weight", self.output_limit_weight, 0.0, exclusive=True)
-        if weight > 1e8:
-            raise MampcError(f"output_limit_weight: expected at most 1e8, received {weight:g}")
+        if weight > LARGEST_LIMIT_WEIGHT:
+            raise MampcError(
+                f"output_limit_weight: expected at most {LARGEST_LIMIT_WEIGHT:g}, received {weight:g}"
+            )
         if n_p * l > MOST_PREDICTIONS:
             raise MampcError(
                 f"prediction_horizon: expected at most {MOST_PREDICTIONS} predicted outputs, "
@@ -175,6 +182,7 @@ class TrackingProblem:
             object.__setattr__(self, name, value)
         self._check_input_cost()
         self._check_zones()
+        self._check_ranks()
         for array in vars(self).values():
             if isinstance(array, np.ndarray):
                 array.flags.writeable = False
@@ -195,6 +203,35 @@ class TrackingProblem:
                     f"u_cost: expected a finite {side} of every input that it pulls there, received u_cost "
                     f"{self.u_cost} and {side} {limit}"
                 )
+
+    def _check_ranks(self) -> None:
+        if self.output_rank is None:
+            return
+        l = self.model.n_outputs
+        ranks = as_vector("output_rank", self.output_rank, l)
+        if not ((ranks >= 1) & (ranks == np.round(ranks))).all():
+            raise MampcError(
+                f"output_rank: expected whole numbers of at least 1, received {self.output_rank!r}"
+            )
+        object.__setattr__(self, "output_rank", ranks.astype(int))
+        if not self.output_limit_weights.max() <= LARGEST_LIMIT_WEIGHT:
+            raise MampcError(
+                f"output_rank: expected output_limit_weight x {RANK_RATIO:g}^(ranks - 1) of at most "
+                f"{LARGEST_LIMIT_WEIGHT:g}, received {self.output_limit_weight:g} and ranks {self.output_rank}"
+            )
+
+    @property
+    def rank_weights(self) -> Array:
+        """How many times its weights the limits and the zone of each output weigh for its rank, shape (l,)."""
+        if self.output_rank is None:
+            return np.ones(self.model.n_outputs)
+        weights: Array = RANK_RATIO ** np.asarray(self.output_rank.max() - self.output_rank, dtype=np.float64)
+        return weights
+
+    @property
+    def output_limit_weights(self) -> Array:
+        """w of each output, its rank included, shape (l,)."""
+        return self.output_limit_weight * self.rank_weights
 
     def _check_zones(self) -> None:
         for name in ("zone_below", "zone_above"):
@@ -238,6 +275,8 @@ class TrackingProblem:
             told += [f"{name}={value!r}"] if value != usual else []
         if self.u_target is not None:
             told += [f"{name}={_short(getattr(self, name))}" for name in ("u_target", "u_target_weight")]
+        if self.output_rank is not None:
+            told += [f"output_rank={self.output_rank.tolist()}"]
         for name in ("u_cost", "zone_below", "zone_above"):
             told += [f"{name}={_short(getattr(self, name))}"] if getattr(self, name).any() else []
         return f"TrackingProblem({', '.join(told)})"

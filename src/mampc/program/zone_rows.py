@@ -34,7 +34,8 @@ class ZoneRows:
         zoned, n_p = problem.zoned, problem.prediction_horizon
         rows = np.tile(zoned, n_p + 1)
         theta, free = prediction.theta[rows], prediction.free[rows]
-        weight = np.tile(np.diag(problem.output_weight)[zoned], n_p + 1)
+        own = np.diag(problem.output_weight)[zoned] * problem.rank_weights[zoned]
+        weight = np.tile(own, n_p + 1)
         low, high = np.zeros((2, len(free), parameter.size))
         low[:, parameter.lower_ends] = np.eye(len(free))
         high[:, parameter.upper_ends] = np.eye(len(free))
@@ -44,7 +45,6 @@ class ZoneRows:
             theta, free = np.vstack([theta, of_moves]), np.vstack([free, means])
             low = np.vstack([low, np.tile(low[len(low) - last :], (pieces, 1))])
             high = np.vstack([high, np.tile(high[len(high) - last :], (pieces, 1))])
-            own = np.diag(problem.output_weight)[zoned]
             weight = np.concatenate([weight, np.outer(weights, own).ravel()])
         self.theta, self.root = theta, np.sqrt(weight)
         self.low, self.high = low - free, high - free

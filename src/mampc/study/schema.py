@@ -152,6 +152,7 @@ class ProblemTable(Table):
     u_cost: Values = 0.0
     zone_below: Widths = 0.0
     zone_above: Widths = 0.0
+    output_rank: Count | list[Count] | None = None
 
 
 class ChangeTable(Table):

@@ -1,0 +1,119 @@
+"""Zones against set points: moves at equal time outside the zone.
+
+    python benchmarks/zones.py            # prints the figures of docs/methods.md; about two minutes
+    python benchmarks/zones.py --figure   # and draws docs/images/zones.svg
+
+A first-order plant, its model exact, with measurement noise sigma and loads at its output that jump at random. Outputs
+are to be within two sigma of their reference. Set point and zone of that width, each with a price per move, over the
+same seeds; the price goes through the values of `PRICES`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import mampc
+
+SIGMA = 0.1
+WIDTH = 2 * SIGMA
+PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
+SEEDS = 40
+STEPS = 200
+LOAD = mampc.loads.RandomSteps(at="output", size=0.5, every=60.0)
+FIGURE = Path(__file__).parents[1] / "docs" / "images" / "zones.svg"
+
+
+class Outcome(NamedTuple):
+    """Means over the seeds: moves a run, share of samples outside the zone and its standard error."""
+
+    name: str
+    price: float
+    moves: float
+    outside: float
+    error: float
+
+
+def outcome(name: str, price: float, **zone: float) -> Outcome:
+    """One controller over all seeds."""
+    model = mampc.StateSpace.from_first_order(gain=[[1.0]], time_constant=[[8.0]], dt=1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=20, control_horizon=3, tail_horizon=20.0, move_weight=0.01,
+        limits=mampc.Limits(u_min=-10.0, u_max=10.0), **zone,
+    )  # fmt: skip
+    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(price=price)))
+    batch = mampc.simulate_batch(
+        model,
+        regulator,
+        model.y_op,
+        steps=STEPS,
+        seeds=range(SEEDS),
+        noise=SIGMA,
+        loads=[LOAD],
+        progress=False,
+    )
+    inputs = np.concatenate([batch.u_initial[:, None], batch.u], axis=1)
+    moves = (np.abs(np.diff(inputs, axis=1)) > 1e-9).sum(axis=(1, 2))
+    outside = (np.abs(batch.y - batch.r) > WIDTH).mean(axis=(1, 2))
+    return Outcome(
+        name, price, float(moves.mean()), float(outside.mean()), float(outside.std() / np.sqrt(SEEDS))
+    )
+
+
+def moves_at(outcomes: list[Outcome], outside: float) -> float:
+    """Moves of a front at a share of time outside, on straight lines between its points; nan beyond them."""
+    by_time = sorted((o.outside, o.moves) for o in outcomes)
+    times, moves = np.array(by_time).T
+    return float(np.interp(outside, times, moves, left=np.nan, right=np.nan))
+
+
+def draw(fronts: dict[str, list[Outcome]]) -> None:
+    """Both fronts in one figure."""
+    import matplotlib.pyplot as plt
+
+    from mampc.base.drawing import styled
+
+    with styled():
+        figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+        for name, outcomes in fronts.items():
+            axes.errorbar(
+                [100 * o.outside for o in outcomes], [o.moves for o in outcomes],
+                xerr=[100 * o.error for o in outcomes], marker="o", label=name,
+            )  # fmt: skip
+        axes.set(xlabel="time outside the zone, %", ylabel=f"moves in {STEPS} samples", ylim=(0, None))
+        axes.legend(frameon=False)
+        figure.savefig(FIGURE)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--figure", action="store_true", help="draw docs/images/zones.svg as well")
+    arguments = parser.parse_args()
+    kinds = {"set point and price": {}, "zone and price": {"zone_below": WIDTH, "zone_above": WIDTH}}
+    every = [(name, price) for name in kinds for price in PRICES]
+    found = [
+        outcome(name, price, **kinds[name])
+        for name, price in track(every, "zones", console=Console(stderr=True))
+    ]
+    fronts = {name: [o for o in found if o.name == name] for name in kinds}
+    table = Table("controller", "price", "moves", "outside", "moves of the set point at equal time")
+    points = fronts["set point and price"]
+    for o in found:
+        equal = "" if o in points else f"{moves_at(points, o.outside):.1f}"
+        outside = f"{100 * o.outside:.1f} +- {100 * o.error:.1f} %"
+        table.add_row(o.name, f"{o.price:g}", f"{o.moves:.1f}", outside, equal)
+    Console(width=110).print(table)
+    if arguments.figure:
+        draw(fronts)
+
+
+if __name__ == "__main__":
+    main()
