@@ -38,6 +38,8 @@ class Loop:
     sensors: mampc.SensorChecks
     max_blind_steps: int
     reference_filter: mampc.ReferenceFilter | None = None
+    counts: bool = False  # on later data, where that can be
+    follows: bool = False  # the noise, with its price, where that can be
 
     @property
     def exactly_sparse(self):
@@ -49,10 +51,18 @@ class Loop:
             controller = mampc.MPC(self.problem)
         else:
             controller = mampc.MAMPC(self.problem, self.rules, method=self.method, **self.settings)
-        return mampc.Regulator(
-            controller, self.estimator, sensors=self.sensors, max_blind_steps=self.max_blind_steps,
-            reference_filter=self.reference_filter,
-        )  # fmt: skip
+        settings = {
+            "sensors": self.sensors, "max_blind_steps": self.max_blind_steps, "reference_filter": self.reference_filter
+        }  # fmt: skip
+        on = {"value_of_information": True, "price_follows_noise": True}
+        for tried in ([on] if self.follows else []) + (
+            [{"value_of_information": True}] if self.counts else []
+        ):
+            try:
+                return mampc.Regulator(controller, self.estimator, **settings, **tried)
+            except mampc.MampcError:  # another estimator or method, or inputs on levels
+                continue
+        return mampc.Regulator(controller, self.estimator, **settings)
 
 
 @st.composite
@@ -185,7 +195,9 @@ def loops(draw):
     smooth = draw(st.sampled_from([None, None, {"time_constant": 3.0}, {"rate": scale}]))
     smooth = None if smooth is None else mampc.ReferenceFilter(**smooth)
     blind = draw(st.sampled_from([0, 0, 2, 5]))
-    return Loop(problem, rules, method, settings, estimator, sensors, blind, smooth)
+    counts = draw(st.booleans())
+    follows = counts and draw(st.booleans())
+    return Loop(problem, rules, method, settings, estimator, sensors, blind, smooth, counts, follows)
 
 
 # Faults. Each is drawn for as many signals as there can be, and cut to those that there are.

@@ -58,6 +58,8 @@ def as_levels(given: Any) -> Any:
         raise MampcError(
             f"levels: expected a step, a mampc.OnOff, or one entry per input, received {shown(given)}"
         )
+    if all(entry is None for entry in given):  # no input has any
+        return None
     return tuple(_as_entry(entry) for entry in given)
 
 
