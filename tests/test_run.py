@@ -56,7 +56,7 @@ def test_a_run_is_written_with_all_its_columns_in_full_precision(tmp_path):
         header, *rows = csv.reader(file)
     assert header == [
         "time", "u1", "u2", "y1", "y2", "y1_measured", "y2_measured", "y1_reference", "y2_reference",
-        "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored", "load",
+        "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored", "load", "variant",
     ]  # fmt: skip
     numbers = np.array([row[:9] for row in rows], dtype=float)
     np.testing.assert_array_equal(numbers, np.column_stack([run.t, run.u, run.y, run.y_measured, run.r]))

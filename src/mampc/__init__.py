@@ -8,7 +8,7 @@ from mampc.base.errors import MampcError, MampcWarning, StudyError
 from mampc.base.names import Names
 from mampc.base.words import Fault, LoadKind, Remark, Status
 from mampc.compare.tuning import Tuned, tune
-from mampc.controllers import MAMPC, MPC, ControllerState, Decision
+from mampc.controllers import MAMPC, MPC, ControllerBank, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
 from mampc.controllers.targets import Targets, targets
 from mampc.identification import (
@@ -69,6 +69,7 @@ __all__ = [
     "MPC",
     "Alternating",
     "Batch",
+    "ControllerBank",
     "ControllerState",
     "Decision",
     "Difference",

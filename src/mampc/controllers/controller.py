@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 from time import perf_counter
 from typing import Any, Self
@@ -103,6 +104,8 @@ class Controller(ABC):
         def on_model(argument: Any) -> Any:
             if isinstance(argument, Controller):
                 return argument.with_model(model)
+            if isinstance(argument, Mapping):
+                return {name: on_model(value) for name, value in argument.items()}
             return replace(argument, model=model) if isinstance(argument, TrackingProblem) else argument
 
         arguments, settings = self._made_of

@@ -63,6 +63,7 @@ class Decision(NamedTuple):
         ignored_outputs: outputs whose measurement was not believed at this sample, by name, and why; filled by
             `Regulator`.
         load: what unmeasured loads seem to do, where the estimator asks; filled by `Regulator`.
+        variant: which controller of a `ControllerBank` decided; else None.
     """
 
     u: Array
@@ -79,6 +80,7 @@ class Decision(NamedTuple):
     resolution: Array
     ignored_outputs: Mapping[str, Fault] = {}
     load: LoadKind | None = None
+    variant: str | None = None
 
     @property
     def gap(self) -> float:
@@ -113,5 +115,7 @@ class Decision(NamedTuple):
             words.append(f"objective={self.objective:.6g}")
             words.append("no bound" if self.gap == np.inf else f"gap={self.gap:.3g}")
         words += [str(remark) for remark in self.remarks]
+        if self.variant is not None:
+            words.append(f"variant={self.variant}")
         words += [f"{name} {fault}" for name, fault in self.ignored_outputs.items()]
         return f"Decision({', '.join(words)})"

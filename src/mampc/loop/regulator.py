@@ -9,6 +9,7 @@ import numpy as np
 
 from mampc.base.checks import LARGEST, Array, as_flag, as_read, as_shaped, as_vector, as_whole, is_usable
 from mampc.base.errors import MampcError
+from mampc.controllers.bank import ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.controllers.mampc import MAMPC
@@ -177,6 +178,7 @@ class Regulator:
         measured_disturbance: Any = None,
         limits: Limits | None = None,
         manual: Any = None,
+        variant: str | None = None,
     ) -> Decision:
         """Decide the inputs of this sample from its measurements.
 
@@ -196,6 +198,7 @@ class Regulator:
                 Left out or not usable, the last one holds on.
             limits, manual: see `Controller.step`. Report `u_applied` while an input is in manual; when it is
                 back in automatic, the first plan starts from there.
+            variant: of a `ControllerBank`, by name.
 
         Raises:
             MampcError: arguments that are no numbers or of the wrong shape.
@@ -225,6 +228,11 @@ class Regulator:
             )
         if tracked is not None:
             reference, tracked = self._filtered(tracked, reference, estimate, u_previous, v, manual)
+        chosen: dict[str, Any] = {}
+        if variant is not None:
+            if not isinstance(self._planner, ControllerBank):
+                raise MampcError(f"variant: expected none without a ControllerBank, received {variant!r}")
+            chosen["variant"] = variant
         blind = sensors.blind > self.max_blind_steps
         decision = self._planner.step(
             memory,
@@ -236,6 +244,7 @@ class Regulator:
             limits=limits,
             manual=manual,
             hypotheses=self.estimator.weights_of(estimate),
+            **chosen,
         )
         return decision._replace(
             state=RegulatorState(

@@ -37,6 +37,7 @@ class Recording:
         u: decided inputs, shape (T, m).
         objective: of each decision, shape (T,), not-a-number where inputs were held.
         status, remarks, ignored, load: of each decision, as text.
+        variant: which controller of a `ControllerBank` decided, by name; empty words where there is none.
         names: of the signals.
     """
 
@@ -50,6 +51,7 @@ class Recording:
     remarks: tuple[str, ...]
     ignored: tuple[str, ...]
     load: tuple[str, ...]
+    variant: tuple[str, ...]
     names: Names
 
     @classmethod
@@ -58,11 +60,22 @@ class Recording:
         objective = np.array([decision.objective for decision in run.decisions])
         status = tuple(decision.status.value for decision in run.decisions)
         said = [told(decision) for decision in run.decisions]
-        remarks, ignored, load = (
-            tuple(words[kind] for words in said) for kind in ("remarks", "ignored", "load")
+        remarks, ignored, load, variant = (
+            tuple(words[kind] for words in said) for kind in ("remarks", "ignored", "load", "variant")
         )
         return cls(
-            run.t, run.y_measured, run.r, run.v, run.u, objective, status, remarks, ignored, load, run.names
+            run.t,
+            run.y_measured,
+            run.r,
+            run.v,
+            run.u,
+            objective,
+            status,
+            remarks,
+            ignored,
+            load,
+            variant,
+            run.names,
         )
 
     @classmethod
@@ -85,6 +98,7 @@ class Recording:
             tuple(table.words("remarks")),
             tuple(table.words("ignored")),
             tuple(table.words("load")),
+            tuple(table.words("variant")),
             names,
         )
 
@@ -142,6 +156,7 @@ def replay(
             recording.y[k],
             recording.r[ahead] if preview else recording.r[k],
             measured_disturbance=recording.v[k] if model.n_disturbances else None,
+            variant=recording.variant[k] or None,
         )
         state = decision.state
         for name, said, says in (

@@ -113,8 +113,8 @@ class Run:
         return signals_figure({"closed loop": self}, look={"closed loop": Look(BLUE)}, limits=limits)
 
     def to_csv(self, path: str | Path) -> None:
-        """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs and
-        what loads seem to do, in full precision; and where the actuators were, if not where they were told to.
+        """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs,
+        what loads seem to do and variant, in full precision; and where the actuators were, if not as told.
         """
         if len(self.decisions) != len(self.t):
             raise MampcError(
@@ -125,7 +125,7 @@ class Run:
             "time", *inputs, *self.names.disturbances, *outputs,
             *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
             "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored",
-            "load",
+            "load", "variant",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
         positions: list[list[float]] = [[] for _ in self.t]
@@ -146,4 +146,9 @@ def told(decision: Decision) -> dict[str, str]:
     """What a decision says beside its numbers and its status, by column of a file."""
     ignored = " ".join(f"{y}:{fault}" for y, fault in decision.ignored_outputs.items())
     load = "" if decision.load is None else str(decision.load)
-    return {"remarks": " ".join(decision.remarks), "ignored": ignored, "load": load}
+    return {
+        "remarks": " ".join(decision.remarks),
+        "ignored": ignored,
+        "load": load,
+        "variant": decision.variant or "",
+    }

@@ -39,6 +39,7 @@ def simulate(
     loads: Sequence[Load] = (),
     valves: Valves | None = None,
     u_initial: Any = None,
+    variant: str | Sequence[str] | None = None,
     progress: bool | None = None,
 ) -> Run:
     """Run a regulator on a plant that starts at rest.
@@ -58,6 +59,7 @@ def simulate(
         loads: of `mampc.loads`, drawn with the seed and added to these disturbances.
         valves: what stands between decided and real inputs (see `Valves`); default inputs are as decided.
         u_initial: inputs at the start, shape (m,); default the plant's usual ones (its `u_op`).
+        variant: of a `ControllerBank`, one name or one for each sample; default its first.
         progress: show a progress bar on the terminal; default: when the run is long.
 
     Raises:
@@ -68,7 +70,8 @@ def simulate(
         input_disturbance=input_disturbance, output_disturbance=output_disturbance,
         measured_disturbance=measured_disturbance, loads=loads, valves=valves, u_initial=u_initial,
     ).drawn(seed)  # fmt: skip
-    return closed_loop(plant, regulator, course, preview=preview, progress=progress)
+    variants = _variants(variant, len(course))
+    return closed_loop(plant, regulator, course, preview=preview, variants=variants, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +186,7 @@ def closed_loop(
     course: Course,
     *,
     preview: bool,
+    variants: Sequence[str] | None = None,
     progress: bool | None,
 ) -> Run:
     """The loop sample by sample."""
@@ -190,6 +194,8 @@ def closed_loop(
     T, start, v, r = len(course), course.u_initial, course.v, course.reference[: len(course)]
     motion = motion_of(plant, model.dt)
     told: list[dict[str, Any]] = [{"measured_disturbance": now} if model.n_disturbances else {} for now in v]
+    for now, name in zip(told, variants or (), strict=False):
+        now["variant"] = name
     x, state = at_rest(plant, regulator, start, v[0])
     shape = (T, len(start))
     inputs, positions, outputs = np.empty(shape), np.empty(shape), np.empty((T, model.n_outputs))
@@ -231,6 +237,17 @@ def at_rest(
     y = motion_of(plant, model.dt).output(x, both)
     told = {"measured_disturbance": v} if model.n_disturbances else {}
     return x, regulator.initial_state(u, y, **told)
+
+
+def _variants(variant: str | Sequence[str] | None, T: int) -> list[str] | None:
+    if variant is None or isinstance(variant, str):
+        return None if variant is None else [variant] * T
+    names = list(variant) if isinstance(variant, Sequence) else [variant]
+    if len(names) != T or not all(isinstance(name, str) for name in names):
+        raise MampcError(
+            f"variant: expected a name or one for each of {T} samples, received {shown(variant)}"
+        )
+    return names
 
 
 def _length(reference: Array, steps: int | None) -> int:

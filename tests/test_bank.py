@@ -1,0 +1,117 @@
+"""Variants of a controller are switched while the loop runs: bumpless, pure, and recorded so that replay follows."""
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import identified_tank, tank_problem
+
+TANK = mampc.plants.QuadrupleTank()
+PRICES = {"calm": 2.0, "brisk": 0.05}
+
+
+def variants(model=None):
+    problem = tank_problem(model or identified_tank())
+    made = {
+        name: mampc.MAMPC(problem, mampc.MoveRules(price=price, max_moves=4, sparsity_horizon=n))
+        for (name, price), n in zip(PRICES.items(), (3, 6), strict=True)
+    }
+    return made | {"plain": mampc.MPC(problem)}
+
+
+def reference(steps=60):
+    y_op = TANK.output(TANK.steady_state())
+    return mampc.steps(steps, y_op, [(5, y_op + 2.0), (30, y_op - 1.0)])
+
+
+def switched(steps=60):
+    return ["brisk" if k < 25 else "plain" if k < 40 else "calm" for k in range(steps)]
+
+
+def run(**settings):
+    regulator = mampc.Regulator(mampc.ControllerBank(variants()))
+    return regulator, mampc.simulate(TANK, regulator, reference(), noise=0.1, progress=False, **settings)
+
+
+@pytest.mark.parametrize("name", ["calm", "brisk", "plain"])
+def test_a_variant_decides_as_its_controller_alone(name):
+    _, ours = run(variant=name)
+    alone = mampc.simulate(TANK, mampc.Regulator(variants()[name]), reference(), noise=0.1, progress=False)
+    np.testing.assert_array_equal(ours.u, alone.u)
+    assert {decision.variant for decision in ours.decisions} == {name}
+
+
+def test_the_first_variant_decides_where_none_is_named():
+    assert {decision.variant for decision in run()[1].decisions} == {"calm"}
+
+
+def test_a_switch_plans_from_the_inputs_that_are_there():
+    _, ours = run(variant=switched())
+    before = np.vstack([ours.u_initial, ours.u[:-1]])
+    planned = np.array([decision.plan[0] - decision.changes[0] for decision in ours.decisions])
+    np.testing.assert_allclose(planned, before, atol=1e-9)
+    moves = ours.metrics().moves.sum()
+    assert (
+        run(variant="calm")[1].metrics().moves.sum() < moves < run(variant="plain")[1].metrics().moves.sum()
+    )
+
+
+def test_moves_made_under_another_variant_count_in_a_budget():
+    bank = mampc.ControllerBank(variants())
+    state = bank.initial_state()
+    x, r = np.zeros(bank.problem.model.n_states), bank.problem.model.y_op
+    for k in range(3):  # every sample moves both inputs
+        state = bank.step(state, x, r + 3.0 * (-1) ** k, variant="plain").state
+    decision = bank.step(state, x, r + 3.0, variant="brisk")
+    assert mampc.Remark.BUDGET_EXCEEDED in decision.remarks
+    assert not decision.moves.any()
+
+
+def test_a_recorded_run_is_replayed_with_the_variants_that_decided(tmp_path):
+    regulator, ours = run(variant=switched())
+    ours.to_csv(tmp_path / "run.csv")
+    recording = mampc.Recording.from_csv(tmp_path / "run.csv", TANK.names)
+    assert list(recording.variant) == switched()
+    start = regulator.initial_state(ours.u_initial, ours.y[0])
+    again = mampc.Regulator(mampc.ControllerBank(variants()))
+    assert mampc.replay(again, start, recording) is None
+
+
+def test_states_are_kept_as_text():
+    regulator, ours = run(variant=switched())
+    state = regulator.initial_state(ours.u_initial)
+    for k, name in enumerate(["plain", "calm", "brisk"]):
+        decision = regulator.step(state, ours.y_measured[k], ours.r[-1], variant=name)
+        state = regulator.state_from_json(decision.state.to_json())
+        assert state.to_json() == decision.state.to_json()
+
+
+def test_variants_with_other_bounds_share_a_state():
+    """A limit of moves adds bounds to the program; active ones are kept where they belong to it."""
+    problem = tank_problem(identified_tank(), limits=mampc.Limits(u_min=45.0, u_max=55.0))
+    tight = tank_problem(problem.model, limits=mampc.Limits(u_min=45.0, u_max=55.0, du_max=1.0))
+    bank = mampc.ControllerBank({"usual": mampc.MPC(problem), "gentle": mampc.MPC(tight)})
+    regulator = mampc.Regulator(bank)
+    names = ["usual", "gentle"] * 20
+    ours = mampc.simulate(TANK, regulator, reference(40), variant=names, progress=False)
+    assert set(ours.statuses) == {"optimal"}
+    assert np.abs(np.diff(ours.u, axis=0))[::2].max() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("made", "expected"),
+    [
+        (lambda: mampc.ControllerBank({}), "by name"),
+        (lambda: mampc.ControllerBank([mampc.MPC(tank_problem(identified_tank()))]), "by name"),
+        (lambda: mampc.ControllerBank({"a": 1}), "MPC or MAMPC"),
+        (lambda: mampc.ControllerBank(variants() | {"x": mampc.MPC(tank_problem(
+            identified_tank(), prediction_horizon=30))}), "horizons"),
+        (lambda: run(variant="fast"), "one of calm, brisk, plain"),
+        (lambda: run(variant=["calm"]), "each of 60 samples"),
+        (lambda: run(variant=3), "each of 60 samples"),
+        (lambda: mampc.simulate(TANK, mampc.Regulator(variants()["plain"]), reference(), variant="calm"), "Bank"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_in_words(made, expected):
+    with pytest.raises(mampc.MampcError, match=expected):
+        made()
