@@ -163,8 +163,8 @@ def test_a_price_that_can_never_pay_is_told_and_is_one(tmp_path):
     study, _ = warned(tmp_path)
     price = study.controllers[1].rules.price
     assert warned(tmp_path)[1] == ()
-    saves = price * 16
-    _, (warning,) = warned(tmp_path, (f"price = {price}", f"price = {1.05 * saves}"))
+    saves = price * 64
+    _, (warning,) = warned(tmp_path, (f"price = {price}", f"price = {1.1 * saves}"))
     assert "'price' can never move" in warning
     for factor, moves in ((1.05, False), (0.9, True)):  # the bound is sharp where no limit is near
         text = own_study(StateSpace.load(tmp_path / "model.json"), "model.json", "own")

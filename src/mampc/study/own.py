@@ -27,7 +27,10 @@ SHORTEST_HORIZON = 10
 ASKED = 0.3  # of what inputs can hold: the change of reference
 GUESSED_NOISE = 0.02  # of that change, where no record told
 MOST_CHANGES = 4  # of single outputs
-PRICE = 1 / 16  # of what moves save after such a change: changes of a quarter of it are still worth them
+HIGHEST_PRICE = (
+    1 / 16
+)  # of what moves save after such a change: changes of a quarter of it are still worth them
+USUAL = 1 / 4  # of the highest price: it costs next to no error
 DEAD_BAND = 0.01  # of the inputs' range
 LARGEST_WEIGHT = 1e9
 LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
@@ -176,7 +179,7 @@ def _stable(problem: TrackingProblem) -> TrackingProblem:
 def _price(problem: TrackingProblem, changes: Array) -> float:
     """A price that pays after every change, and leaves at most half of it where `largest_offset` promises anything."""
     condensed, m = CondensedQP(problem), problem.model.n_inputs
-    price = PRICE * min(largest_saving(condensed, change) for change in changes) / m
+    price = HIGHEST_PRICE * min(largest_saving(condensed, change) for change in changes) / m
     offset = largest_offset(problem, MoveRules(price=price))
     asked = np.where(changes != 0, np.abs(changes), np.inf).min(axis=0)
     share = offset[np.isfinite(asked)] / asked[np.isfinite(asked)]
@@ -257,16 +260,19 @@ seed = 0
 name = "MPC"
 method = "mpc"
 
-# A move must save this much; changes of the reference save {round(1 / PRICE)} times as much for each input, or more.
+# A move must save this much; changes of the reference save {round(1 / USUAL / HIGHEST_PRICE)} times as much for each
+# input, or more.
+# `mampc tune THIS-FILE --max-error-increase 25%` finds the price for the error that you allow.
 [[controllers]]
 name = "price"
 method = "exact"
-rules = {{ price = {_number(plan.price)} }}
+rules = {{ price = {_number(float(f"{USUAL * plan.price:.2g}"))} }}
 
+# Fewer moves for more error; smaller changes are not followed.
 [[controllers]]
-name = "lower price"
+name = "higher price"
 method = "exact"
-rules = {{ price = {_number(plan.price / 4)} }}
+rules = {{ price = {_number(plan.price)} }}
 
 # What one would use instead: moves below a size are left out.
 [[controllers]]
