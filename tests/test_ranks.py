@@ -1,6 +1,7 @@
 """Ranks of outputs: limits and zones of a lower rank cost those of a higher one nothing."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,15 +14,11 @@ from referees import objective_of
 def torn(ranks, **changes):
     """One input that moves two outputs, whose limits or zones cannot both be kept."""
     model = mampc.StateSpace.from_first_order(gain=[[1.0], [0.7]], time_constant=[[6.0], [15.0]], dt=1.0)
-    settings = {"limits": mampc.Limits(y_min=[1.0, -np.inf], y_max=[np.inf, 0.2])}
-    return mampc.TrackingProblem(
-        model,
-        prediction_horizon=20,
-        control_horizon=4,
-        move_weight=0.01,
-        output_rank=ranks,
-        **settings | changes,
-    )
+    settings = {
+        "prediction_horizon": 20, "control_horizon": 4, "move_weight": 0.01, "output_rank": ranks,
+        "limits": mampc.Limits(y_min=[1.0, -np.inf], y_max=[np.inf, 0.2]),
+    }  # fmt: skip
+    return mampc.TrackingProblem(model, **settings | changes)
 
 
 def decided(problem, reference=(0.0, 0.0), rules=None):
@@ -73,6 +70,21 @@ def test_ranks_weigh_a_hundred_times_each_and_objectives_say_so():
         assert decision.objective == pytest.approx(
             cost_of(problem, x, model.u_op, reference, decision.plan), rel=1e-8
         )
+
+
+def test_inputs_on_levels_are_proven_best_with_ranks_and_zones():
+    levels = (-1.0, 0.0, 0.6, 1.4)
+    rules = mampc.MoveRules(price=0.05, levels=[list(levels)])
+    for changes in ({}, {"zone_below": 0.1, "zone_above": [0.1, 0.0]}):
+        for ranks in ([1, 2], [2, 1]):
+            problem = torn(ranks, control_horizon=3, output_limit_weight=20.0, **changes)
+            sparse, reference = mampc.MAMPC(problem, rules), np.array([1.0, 0.5])
+            state, x = sparse.initial_state(), np.full(problem.model.n_states, 0.1)
+            decision = sparse.step(state, x, reference)
+            every = [np.array(course)[:, None] for course in product(levels, repeat=3)]
+            costs = [objective_of(problem, rules, x, state.inputs, reference, plan) for plan in every]
+            assert decision.status == "optimal"
+            assert decision.objective == pytest.approx(min(costs), rel=1e-8)
 
 
 def test_equal_ranks_are_none():

@@ -197,7 +197,7 @@ class LimitedOutputs:
 
     def __init__(self, condensed: CondensedQP) -> None:
         bounds, m = condensed.bounds, condensed.problem.model.n_inputs
-        self._bounds, self._weight = bounds, condensed.problem.output_limit_weight
+        self._bounds, self._weights = bounds, condensed.problem.output_limit_weights
         rows, self._output, self._fading = bounds.output_rows()
         self.rows = rows
         self.last = _last_sample(rows, m)
@@ -219,7 +219,7 @@ class LimitedOutputs:
 
     def penalty(self, excess: Array) -> Array:
         """What violations cost, shape (K,)."""
-        return np.asarray(self._weight * (excess + 0.5 * excess * excess).sum(axis=1))
+        return np.asarray((excess + 0.5 * excess * excess) @ self._weights)
 
     def none(self, count: int) -> Array:
         return np.zeros((count, self._n_outputs))
