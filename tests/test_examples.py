@@ -82,3 +82,11 @@ def test_the_more_important_level_stays_within_its_limit():
         for run in runs.values():
             assert run.y[-1, 0] < 22.0
             assert (run.y[-1, 1] <= 41.0) == kept
+
+
+def test_compensated_valves_need_fewer_moves_at_a_smaller_error(found):
+    for runs in found("sticking-valves").values():
+        moves = {name: run.metrics(threshold=0.0).moves.sum() for name, run in runs.items()}
+        errors = {name: run.metrics(skip=15).tracking_error for name, run in runs.items()}
+        assert moves["price, compensated"] < 0.85 * moves["price"]
+        assert errors["price, compensated"] < 0.9 * errors["price"]

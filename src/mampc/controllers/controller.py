@@ -200,6 +200,11 @@ class Controller(ABC):
             plan = doubted(plan, self.condensed, sample)
         return self._decision(plan, state, limits_now.inputs, start)
 
+    def range_now(self, limits: Limits | None) -> tuple[Array, Array]:
+        """Least and largest inputs of this sample, shape (m,) each; `limits` as `step` takes them."""
+        usual = self._usual_limits if limits is None else LimitsNow(limits, self.condensed, self.levels)
+        return usual.inputs.low[0], usual.inputs.high[0]
+
     def manual_inputs(self, manual: Any) -> BoolArray | None:
         """Which inputs are in manual, shape (m,), as `step` takes it; None for no input.
 

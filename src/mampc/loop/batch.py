@@ -374,6 +374,7 @@ def _steps_like(own: Regulator, other: Regulator) -> bool:
         and own.controller.problem is other.controller.problem
         and own.sensors is other.sensors
         and own.reference_filter is other.reference_filter
+        and own.valves is None
     )
 
 

@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import LARGEST, Array, as_flag, as_read, as_shaped, as_vector, as_whole, is_usable
+from mampc.base.checks import (
+    LARGEST,
+    Array,
+    as_flag,
+    as_instance,
+    as_read,
+    as_shaped,
+    as_vector,
+    as_whole,
+    is_usable,
+)
 from mampc.base.errors import MampcError
 from mampc.controllers.bank import ControllerBank
 from mampc.controllers.controller import Controller
@@ -18,6 +28,7 @@ from mampc.loop.estimation import Estimate, Estimator, KalmanFilter
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.sensors import Judged, SensorChecks, SensorState
 from mampc.loop.state import RegulatorState
+from mampc.loop.valves import Compensation, Valves
 from mampc.program.daqp import active_flags
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.state_space import StateSpace
@@ -43,6 +54,10 @@ class Regulator:
             input's range, or 1e-6 where that is not finite.
         reference_filter: lags and ramps between the references given and those tracked; default none. They start
             from the outputs, also when the last input comes back from manual.
+        valves: what is known of valves that stick or have play. Then positions of their stems are planned, and inputs
+            decided that bring them there: a reversal is larger by `band - jump`. `u_applied` are positions, and so are
+            plan and changes of decisions. Moves of less than `jump` are not executed, so that rules have at least that
+            for `min_size`, and some more.
 
     Raises:
         MampcError: arguments of other types, or an estimator of a model of other dimensions.
@@ -59,6 +74,7 @@ class Regulator:
         price_follows_noise: bool = False,
         applied_tolerance: Any = None,
         reference_filter: ReferenceFilter | None = None,
+        valves: Valves | None = None,
     ) -> None:
         if not isinstance(controller, Controller):
             raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
@@ -93,6 +109,9 @@ class Regulator:
         if reference_filter is not None:
             self._filter = reference_filter.fitted(model.n_outputs, model.dt)
         self._samples = controller.problem.prediction_horizon + 1
+        self.valves, self._compensation = valves, None
+        if valves is not None:
+            self._compensation = _compensation(valves, controller)
         # What plans predict with may have more states than the plant.
         self._planner = controller
         if self.estimator.planning_model is not self.estimator.model:
@@ -131,7 +150,8 @@ class Regulator:
         tracked = None
         if self._filter is not None:
             tracked = self._outputs(estimate, controller.inputs[-1], v) if y is None else as_vector("y", y, l)
-        return RegulatorState(controller, estimate, v, sensors, actuators, tracked)
+        command = None if self._compensation is None else controller.inputs[-1]
+        return RegulatorState(controller, estimate, v, sensors, actuators, tracked, command)
 
     def state_from_json(self, text: str) -> RegulatorState:
         """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
@@ -226,6 +246,9 @@ class Regulator:
             raise MampcError(
                 f"state: expected one of a regulator {kind} reference filter, received another's"
             )
+        if (state.command is None) is not (self._compensation is None):
+            kind = "without" if self._compensation is None else "with"
+            raise MampcError(f"state: expected one of a regulator {kind} valves, received another's")
         if tracked is not None:
             reference, tracked = self._filtered(tracked, reference, estimate, u_previous, v, manual)
         chosen: dict[str, Any] = {}
@@ -246,9 +269,18 @@ class Regulator:
             hypotheses=self.estimator.weights_of(estimate),
             **chosen,
         )
+        command, positions, memory = None, decision.u, decision.state
+        if self._compensation is not None and state.command is not None:
+            in_manual = self.controller.manual_inputs(manual)
+            last = state.command if in_manual is None else np.where(in_manual, u_previous, state.command)
+            command, positions = self._compensation.decided(
+                positions, u_previous, last, *self._planner.range_now(limits)
+            )
+            memory = memory._replace(inputs=np.concatenate((memory.inputs[:-1], positions[None])))
+            decision = decision._replace(u=command)
         return decision._replace(
             state=RegulatorState(
-                decision.state, estimate, v, sensors, actuators.decided(decision.u), tracked
+                memory, estimate, v, sensors, actuators.decided(positions), tracked, command
             ),
             ignored_outputs=judged.faults,
             load=self.estimator.load(estimate),
@@ -307,6 +339,22 @@ class Regulator:
         if judged.believed.any():
             estimate = estimator.corrected(estimate, innovation, judged.believed)
         return estimate, judged, sensors
+
+
+def _compensation(valves: Valves, controller: Controller) -> Compensation:
+    """That of a controller's valves; raises `MampcError` where its moves are not executed."""
+    compensation = Compensation(as_instance("valves", valves, Valves), controller.problem.model.n_inputs)
+    if type(controller) is not MAMPC or controller.levels is not None:
+        raise MampcError(
+            f"valves: expected a MAMPC of inputs without levels, received {type(controller).__name__}"
+        )
+    size = as_vector("min_size", controller.rules.min_size, controller.problem.model.n_inputs)
+    if ((size <= compensation.jump) & (compensation.jump > 0)).any():
+        raise MampcError(
+            f"valves: expected rules with a min_size above the jump of {compensation.jump}, since smaller moves are "
+            f"not executed, received {size}"
+        )
+    return compensation
 
 
 def _with_information(planner: Controller, estimator: Estimator, price_follows_noise: bool) -> Controller:

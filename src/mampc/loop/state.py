@@ -30,6 +30,8 @@ class RegulatorState:
         sensors: what the sensor checks remember.
         actuators: what is remembered of the actuators.
         reference: tracked last, shape (l,), where a reference filter leads to the ones given; else None.
+        command: inputs decided last, shape (m,), where valves are compensated, whose positions the controller has in
+            place of them; else None.
     """
 
     controller: ControllerState
@@ -38,6 +40,7 @@ class RegulatorState:
     sensors: SensorState
     actuators: ActuatorState
     reference: Array | None = None
+    command: Array | None = None
 
     def to_json(self) -> str:
         """The state as JSON text; `Regulator.state_from_json` gives the same numbers back."""
@@ -80,7 +83,8 @@ class RegulatorState:
             f"{part}.{name}": value for part, held in parts.items() for name, value in vars(held).items()
         }
         places |= {f"controller.{name}": value for name, value in self.controller._asdict().items()}
-        places["measured_disturbance"], places["reference"] = self.measured_disturbance, self.reference
+        places["measured_disturbance"] = self.measured_disturbance
+        places["reference"], places["command"] = self.reference, self.command
         return {place: None if value is None else np.shape(value) for place, value in places.items()}
 
 

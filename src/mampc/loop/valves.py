@@ -2,7 +2,11 @@
 
 With f_S = (band + jump) / 2 the static and f_D = (band - jump) / 2 the kinetic friction, a stem stays where it is while
 the force e that has built up since, e+ = e + du, is within f_S; beyond it the stem slips to u - f_D sign(e), and
-e = f_D sign(e) is left.
+e = f_D sign(e) is left. So e is always what the decided input and the stem are apart, and a stem at p goes to q where
+
+    |q - p| > jump    and    u = q + f_D sign(q - p):
+
+smaller moves are not executed, and a reversal takes band - jump = 2 f_D more.
 
 Source: He, Wang, Pottmann, Qin: A curve fitting method for detecting valve stiction in oscillating control loops,
 Industrial & Engineering Chemistry Research 46 (2007). The two parameters are those of Choudhury, Thornhill, Shah:
@@ -86,3 +90,38 @@ class Stems:
             force=np.where(slips, left, force),
             decided=u,
         )
+
+
+class Compensation:
+    """Decided inputs that bring stems where they are planned.
+
+    Args:
+        valves: what is known of them.
+        n_inputs: how many there are.
+    """
+
+    def __init__(self, valves: Valves, n_inputs: int) -> None:
+        stems = valves.initial(np.zeros(n_inputs))
+        self._static, self._kinetic = stems.static, stems.kinetic
+        self.jump = stems.static - stems.kinetic
+
+    def decided(
+        self, planned: Array, position: Array, last: Array, low: Array, high: Array
+    ) -> tuple[Array, Array]:
+        """The inputs, within their limits, and where the stems come to be, all of shape (m,).
+
+        Args:
+            planned: where they are to go.
+            position: where they are; those that are to stay there keep their last input.
+            last: inputs decided last.
+            low, high: limits of the inputs.
+        """
+        # Where the last input would move a stem, somebody else has moved it since.
+        last = np.where(np.abs(last - position) > self._static * (1 + 1e-9), position, last)
+        way = np.sign(planned - position)
+        u = np.minimum(np.maximum(np.where(way == 0, last, planned + self._kinetic * way), low), high)
+        force = u - position
+        slips = np.abs(force) > self._static
+        # Where limits do not cut the input short, the stem is where it was planned, to the last digit.
+        reached = np.where(u == planned + self._kinetic * way, planned, u - self._kinetic * np.sign(force))
+        return u, np.where(slips, reached, position)

@@ -42,6 +42,8 @@ from mampc.systems.mismatch import Mismatch
 from mampc.systems.signals import prbs, steps
 from mampc.systems.state_space import StateSpace
 
+EXECUTED = 1.05  # of what a valve does not answer: the least move, since nobody knows that exactly
+
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
@@ -142,7 +144,11 @@ def prepare(
 def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
     """The regulator that a study's tables describe."""
     problem = _problem(study, model)
-    controller, estimator = _controller(problem, table), _estimator(study, problem)
+    estimator, valves = _estimator(study, problem), None
+    if table.compensate and study.actuators is not None:
+        valves = study.actuators.valves()
+        table = _executed(table, valves, model.n_inputs)
+    controller = _controller(problem, table)
     counts = study.estimator.value_of_information and type(controller) is MAMPC
     smooth = None if table.reference_filter is None else table.reference_filter.made()
     try:
@@ -150,12 +156,24 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
             controller,
             estimator,
             reference_filter=smooth,
+            valves=valves,
             value_of_information=counts,
             price_follows_noise=counts and study.estimator.price_follows_noise,
             **_sensors(study),
         )
     except MampcError as error:
-        raise StudyError(f"controllers, {table.name!r}, reference_filter: {error}") from None
+        raise StudyError(f"controllers, {table.name!r}: {error}") from None
+
+
+def _executed(table: ControllerTable, valves: Valves, n_inputs: int) -> ControllerTable:
+    """The controller with moves that valves execute, and some more."""
+    assert table.rules is not None
+    try:
+        least = EXECUTED * as_vector("actuators.jump", valves.jump, n_inputs)
+        size = np.maximum(as_vector("min_size", table.rules.min_size, n_inputs), least)
+    except MampcError as error:
+        raise StudyError(f"controllers, {table.name!r}: {error}") from None
+    return table.model_copy(update={"rules": table.rules.model_copy(update={"min_size": size.tolist()})})
 
 
 def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator) -> Run:

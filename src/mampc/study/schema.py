@@ -257,8 +257,24 @@ class ActuatorsTable(Table):
     """What is known of the actuators: their dead-band, and what their maker says they stand."""
 
     dead_band: NotNegative | list[NotNegative] = 0.0
+    band: NotNegative | list[NotNegative] | None = None
+    jump: NotNegative | list[NotNegative] | None = None
     starts_per_hour: Positive | list[Positive] | None = None
     million_starts: Positive | list[Positive] | None = None
+
+    def valves(self) -> Valves:
+        """What is known of how they stick; with a dead-band alone they go where they are told after larger changes."""
+        band = self.dead_band if self.band is None else self.band
+        jump = (self.dead_band if self.band is None else 0.0) if self.jump is None else self.jump
+        return Valves(band=band, jump=jump)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ActuatorsTable:
+        try:
+            self.valves()
+        except MampcError as error:
+            raise ValueError(f"other actuators: {error}") from None
+        return self
 
 
 class ReferenceFilterTable(Table):
@@ -337,10 +353,13 @@ class ControllerTable(Table):
     on_limit_violation: Literal["keep_budget", "ignore_budget"] = "keep_budget"
     violation_margin: Values = 0.0
     reference_filter: ReferenceFilterTable | None = None
+    compensate: bool = False
     published: PublishedTable | None = None
 
     @model_validator(mode="after")
     def _rules_where_needed(self) -> ControllerTable:
+        if self.compensate and self.method not in METHODS:
+            raise ValueError(f"compensate with one of {', '.join(METHODS)} only; received {self.method!r}")
         if self.method in RIVALS:
             return self._as_rival()
         if self.around != "mpc":
@@ -453,6 +472,10 @@ class Study(Table):
             raise ValueError("a table [model] with a file for plant.kind = 'model'")
         if self.plant.kind == "model" and self.plant.parameters:
             raise ValueError("no plant.parameters for plant.kind = 'model'")
+        if any(table.compensate for table in self.controllers) and self.actuators is None:
+            raise ValueError(
+                "a table [actuators] with a dead_band, or a band and jump, for controllers that compensate it"
+            )
         if self.skip >= self.steps:
             raise ValueError(f"a skip below the {self.steps} steps; received {self.skip}")
         for kind in ("scenarios", "controllers"):

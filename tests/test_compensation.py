@@ -1,0 +1,137 @@
+"""Valves that stick and have play, and are known: only moves that they execute, reversals larger by their play."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import same_decision, tank_model, tank_problem
+from referees import moved
+
+STICKING = {"play": (2.0, 0.0), "both": (2.0, 1.0), "stiction": (2.0, 2.0)}
+each_valve = pytest.mark.parametrize(("band", "jump"), STICKING.values(), ids=STICKING)
+MODEL = tank_model()
+PROBLEM = tank_problem(MODEL, tail_horizon=10.0, move_weight=0.03)
+
+
+def loop(valves, jump=0.0, *, price=0.1, problem=PROBLEM, method="exact"):
+    settings = {"polish": True, "warm_up": 0} if method == "alternating" else {}
+    rules = mampc.MoveRules(price=price, min_size=1.05 * np.asarray(jump))
+    return mampc.Regulator(mampc.MAMPC(problem, rules, method=method, **settings), valves=valves)
+
+
+def run_of(regulator, valves, *, noise=0.0, steps=200, seed=0):
+    reference = mampc.steps(steps, MODEL.y_op, [(5, MODEL.y_op + 1.0)])
+    return mampc.simulate(
+        MODEL, regulator, reference, noise=noise, seed=seed, valves=valves, input_disturbance=3.0
+    )
+
+
+@each_valve
+def test_there_is_no_limit_cycle_and_fewer_moves_at_a_smaller_error(band, jump):
+    valves = mampc.Valves(band=band, jump=jump)
+    without, compensated = run_of(loop(None), valves), run_of(loop(valves, jump), valves)
+    assert not moved(compensated.u[100:]).any()
+    assert moved(compensated.u).sum() < 0.6 * moved(without.u).sum()
+    errors = [run.metrics(skip=10).tracking_error for run in (compensated, without)]
+    assert errors[0] < 0.6 * errors[1]
+    if jump:
+        assert moved(without.u[100:]).sum() > 5  # it hunts
+
+
+@each_valve
+def test_under_noise_fewer_moves_do_at_no_larger_error(band, jump):
+    valves = mampc.Valves(band=band, jump=jump)
+    moves, errors = np.zeros(2), np.zeros(2)
+    for seed in range(3):
+        for k, regulator in enumerate((loop(None), loop(valves, jump, price=0.4))):
+            run = run_of(regulator, valves, noise=0.1, seed=seed)
+            moves[k] += moved(run.u).sum()
+            errors[k] += run.metrics(skip=10).tracking_error
+    assert moves[1] < 0.8 * moves[0]
+    assert errors[1] < errors[0]
+
+
+@each_valve
+@pytest.mark.parametrize("method", ["exact", "greedy", "alternating"])
+def test_stems_are_where_they_are_planned_and_every_move_is_executed(band, jump, method):
+    valves = mampc.Valves(band=band, jump=jump)
+    run = run_of(loop(valves, jump, method=method), valves, noise=0.1, steps=60)
+    planned = np.array([decision.plan[0] for decision in run.decisions])
+    np.testing.assert_allclose(run.position, planned, atol=1e-9)
+    np.testing.assert_array_equal(moved(run.u), moved(run.position))
+
+
+def test_inputs_stay_within_their_limits_and_stems_are_known_where_these_cut_them_short():
+    valves = mampc.Valves(band=4.0, jump=1.0)
+    limits = mampc.Limits(u_min=MODEL.u_op - 3.0, u_max=MODEL.u_op + 3.0)
+    problem = tank_problem(MODEL, tail_horizon=10.0, limits=limits)
+    regulator = loop(valves, 1.0, problem=problem)
+    state, stems = regulator.initial_state(), valves.initial(MODEL.u_op)
+    for k in range(30):
+        decision = regulator.step(state, MODEL.y_op, MODEL.y_op + 5.0 * (-1) ** (k // 5))
+        state, stems = decision.state, stems.moved(decision.u)
+        assert (decision.u >= limits.u_min).all()
+        assert (decision.u <= limits.u_max).all()
+        np.testing.assert_allclose(state.controller.inputs[-1], stems.position, atol=1e-9)
+
+
+def test_after_manual_operation_the_last_input_is_not_sent_again():
+    valves = mampc.Valves(band=2.0, jump=1.0)
+    regulator = loop(valves, 1.0, price=1e3)
+    y, elsewhere = MODEL.y_op, MODEL.u_op + np.array([10.0, -5.0])
+    state = regulator.step(regulator.initial_state(), y, y).state
+    decision = regulator.step(state, y, y, u_applied=elsewhere, manual=[True, True])
+    np.testing.assert_array_equal(decision.u, elsewhere)
+    again = regulator.step(decision.state, y, y)
+    np.testing.assert_array_equal(again.u, elsewhere)
+    stuck = regulator.step(state, y, y, u_applied=elsewhere)  # nor where nobody said that it is in manual
+    np.testing.assert_array_equal(stuck.u, elsewhere)
+
+
+@each_valve
+def test_units_decide_nothing(band, jump):
+    inputs, scale = [], np.array([1e4, 1e-4])
+    for unit in (np.ones(2), scale):
+        model = replace(MODEL, B=MODEL.B / unit, u_op=unit * MODEL.u_op)
+        limits = mampc.Limits(u_min=0.0 * unit, u_max=100.0 * unit)
+        problem = tank_problem(model, tail_horizon=10.0, move_weight=0.03 / unit**2, limits=limits)
+        valves = mampc.Valves(band=band * unit, jump=jump * unit)
+        regulator = loop(valves, jump * unit, problem=problem)
+        reference = mampc.steps(40, MODEL.y_op, [(5, MODEL.y_op + 1.0)])
+        run = mampc.simulate(model, regulator, reference, valves=valves, input_disturbance=3.0 * unit)
+        inputs.append(run.u / unit)
+    np.testing.assert_allclose(*inputs, atol=1e-6)
+
+
+def test_a_run_replays_and_comes_out_the_same_among_many():
+    valves = mampc.Valves(band=2.0, jump=1.0)
+    run = run_of(loop(valves, 1.0), valves, noise=0.1, steps=40)
+    state = loop(valves, 1.0).initial_state(MODEL.u_op, MODEL.y_op)
+    start = mampc.simulate(MODEL, loop(valves, 1.0), [*MODEL.y_op], steps=1).y[0]
+    state = loop(valves, 1.0).initial_state(MODEL.u_op, start)
+    assert mampc.replay(loop(valves, 1.0), state, mampc.Recording.of(run)) is None
+    reference = mampc.steps(40, MODEL.y_op, [(5, MODEL.y_op + 1.0)])
+    settings = {"noise": 0.1, "valves": valves, "input_disturbance": 3.0}
+    batch = mampc.simulate_batch(MODEL, loop(valves, 1.0), reference, seeds=[0], **settings)
+    np.testing.assert_array_equal(batch.u[0], run.u)
+    regulator, y = loop(valves, 1.0), MODEL.y_op
+    decision = regulator.step(state, y, y + 2.0)
+    kept = regulator.state_from_json(decision.state.to_json())
+    assert same_decision(regulator.step(kept, y, y - 1.0), regulator.step(decision.state, y, y - 1.0), atol=0)
+
+
+def test_what_valves_would_not_execute_is_refused():
+    valves = mampc.Valves(band=2.0, jump=1.0)
+    with pytest.raises(mampc.MampcError, match="min_size above the jump"):
+        mampc.Regulator(mampc.MAMPC(PROBLEM, mampc.MoveRules(price=1.0, min_size=1.0)), valves=valves)
+    with pytest.raises(mampc.MampcError, match="without levels"):
+        mampc.Regulator(mampc.MAMPC(PROBLEM, mampc.MoveRules(levels=5.0, min_size=2.0)), valves=valves)
+    with pytest.raises(mampc.MampcError, match="expected a MAMPC"):
+        mampc.Regulator(mampc.MPC(PROBLEM), valves=valves)
+    with pytest.raises(mampc.MampcError, match="valves"):
+        mampc.Regulator(mampc.MAMPC(PROBLEM, mampc.MoveRules(price=1.0)), valves=2.0)
+    other = loop(None).initial_state()
+    with pytest.raises(mampc.MampcError, match="with valves"):
+        loop(valves, 1.0).step(other, MODEL.y_op, MODEL.y_op)
