@@ -204,6 +204,21 @@ def test_noise_within_a_zone_moves_nothing():
     assert run.metrics(threshold=1e-9).moves.sum() == 0
 
 
+def test_noise_at_the_edge_of_a_zone_moves_nothing_that_has_a_price():
+    problem = tank_problem(zone_below=0.5, zone_above=0.5)
+    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(price=1.0)))
+    plain = mampc.Regulator(mampc.MPC(problem))
+    load = [0.5, 0.5]  # takes both outputs to their edge
+    moves = []
+    for one in (regulator, plain):
+        run = mampc.simulate(
+            tank_model(), one, problem.model.y_op, steps=60, noise=0.05, seed=1, output_disturbance=load
+        )
+        moves.append(run.metrics(threshold=1e-9, skip=10).moves.sum())
+    assert moves[0] == 0
+    assert moves[1] > 5
+
+
 def test_one_sided_zones_push_one_way_only():
     problem = tank_problem(zone_below=0.0, zone_above=INF)
     mpc, model = mampc.MPC(problem), problem.model

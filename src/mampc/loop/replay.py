@@ -26,7 +26,7 @@ SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
 class Recording:
     """What a regulator was told in T samples of a simulated run, and what it decided, in engineering units.
 
-    (Neither applied inputs that differ from the decided ones, nor limits of single samples, nor inputs in
+    (Neither applied inputs that differ from the decided ones, nor limits or zones of single samples, nor inputs in
     manual; nor, with preview, a reference that goes on beyond the run.)
 
     Attributes:
