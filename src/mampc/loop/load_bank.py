@@ -346,17 +346,17 @@ class LoadBank(Estimator):
         """The estimate after Bayes' rule, from the innovations made white, shape (..., B, l)."""
         surprise = np.einsum("...bi,...bi->...b", white, white)
         likelihood = filters.log_scale - 0.5 * surprise / bank.scale[..., :1]
-        weights = c * np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
+        if likelihood.ndim == 1:
+            weights = c * np.exp(likelihood - likelihood[likelihood.argmax()])
+        else:
+            weights = c * np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
         weights /= weights.dot(self._ones)[..., None]
         usual = np.maximum((1 - FORGETS) * bank.usual + FORGETS * weights, LEAST) * self._lasts
         usual /= usual.dot(self._ones)[..., None]
         if not filters.believed:
             return self._estimate(members, weights, usual, bank.scale)
-        variance, seen = bank.scale[..., 0], np.minimum(bank.scale[..., 1] + 1, NOISE_REMEMBERED)
         shown = np.einsum("...b,...b->...", weights, surprise) / filters.believed
-        variance = variance + (np.clip(shown, 0.0, UNUSUAL * variance) - variance) / seen
-        scale = np.stack([np.clip(variance, *NOISE_RANGE), seen], axis=-1)
-        return self._estimate(members, weights, usual, scale)
+        return self._estimate(members, weights, usual, _rescaled(bank.scale, shown))
 
     def _estimate(self, members: Array, weights: Array, usual: Array, scale: Array) -> BankEstimate:
         shape = (*weights.shape[:-1], -1)
@@ -376,6 +376,18 @@ class LoadBank(Estimator):
         model = self.model
         change: Array = np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op
         return change
+
+
+def _rescaled(scale: Array, shown: Array) -> Array:
+    """The scale of a `BankEstimate` after innovations of this squared size, of one loop or of many."""
+    if scale.ndim > 1:
+        variance, seen = scale[:, 0], np.minimum(scale[:, 1] + 1, NOISE_REMEMBERED)
+        variance = variance + (np.minimum(shown, UNUSUAL * variance) - variance) / seen
+        return np.stack([np.clip(variance, *NOISE_RANGE), seen], axis=1)
+    before, samples = scale.tolist()
+    samples = min(samples + 1, NOISE_REMEMBERED)
+    after = before + (min(float(shown), UNUSUAL * before) - before) / samples
+    return np.array((min(max(after, NOISE_RANGE[0]), NOISE_RANGE[1]), samples))
 
 
 def _identified(model: StateSpace) -> Array | None:

@@ -30,6 +30,8 @@ from mampc.base.errors import MampcError, MampcWarning
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import Limits, TrackingProblem
 
+MOST_KEPT = 30_000  # patterns
+
 
 class Information:
     """What every pattern forgoes; see the module.
@@ -70,20 +72,32 @@ class Information:
             )
             shifted = np.matmul(of_estimate, shifts[:, j - 1])  # (B, moves, l)
             self._later.append((condensed.U, shifted.swapaxes(0, 1).reshape(len(of_estimate), -1)))
-        self._known: dict[tuple[int, bytes], Array] = {}
+        self._known: dict[bytes, Array] = {}
+        self._parts: dict[tuple[int, bytes], Array] = {}
         self._tables: dict[int, tuple[BoolArray, Array, Array]] = {}
 
     def forgone(self, pattern: BoolArray) -> Array:
         """Of a pattern, shape (n_moves,), under each hypothesis, shape (B,)."""
-        total = np.zeros(self.hypotheses)
-        for j in range(len(self._later)):
-            later = pattern[(j + 1) * self._m :]
-            key = j, later.tobytes()
-            known = self._known.get(key)
-            if known is None:
-                known = self._known[key] = self._missed(j, later)
-            total += known
-        return total
+        key = pattern.tobytes()
+        known = self._known.get(key)
+        if known is None:
+            if len(self._known) > MOST_KEPT:
+                self._known.clear()
+            known = self._known[key] = sum(
+                (self._part(j, pattern[(j + 1) * self._m :]) for j in range(len(self._later))),
+                np.zeros(self.hypotheses),
+            )
+        return known
+
+    def _part(self, j: int, later: BoolArray) -> Array:
+        """By what a pattern has at the samples from j + 1 on, which many have alike."""
+        key = j, later.tobytes()
+        known = self._parts.get(key)
+        if known is None:
+            if len(self._parts) > MOST_KEPT:
+                self._parts.clear()
+            known = self._parts[key] = self._missed(j, later)
+        return known
 
     def price(self, pattern: BoolArray) -> float:
         """Of a pattern, shape (n_moves,), where prices follow the noise; else 0."""
