@@ -11,8 +11,9 @@ from builders import tank_model
 from mampc.cli import app
 from mampc.compare import scenarios, tuning
 from mampc.compare.scenarios import settling, usual_problem
+from mampc.compare.tuned_study import study_of_model, with_tuning
 from mampc.study import load_study, parse_study
-from mampc.study.running import run_study
+from mampc.study.running import regulator_of, run_study
 from mampc.study.writing import study_text
 
 SMALL = {
@@ -294,3 +295,20 @@ def test_a_study_that_is_written_is_read_back_the_same(name):
     for one in (study, odd):
         again = parse_study(study_text(one, "a\nb"))
         assert again.model_copy(update={"place": one.place}) == one
+
+
+@pytest.mark.parametrize("noise", [None, 0.1])
+def test_the_regulator_of_the_study_that_is_written_decides_as_the_one_found(noise):
+    model = tank_model()
+    found = tuned(model, limits=mampc.Limits(u_min=0.0, u_max=100.0), noise=noise)
+    assert found.reached
+    assert found.noise_guessed == (noise is None)
+    study = with_tuning(study_of_model(model, found, "tank"), found)
+    written = regulator_of(parse_study(study_text(study)), model, study.controllers[0])
+    reference = mampc.steps(40, model.y_op, [(5, model.y_op + 1.0), (25, model.y_op)])
+    runs = [
+        mampc.simulate(model, regulator, reference, noise=0.1, seed=1, progress=False)
+        for regulator in (found.regulator, written)
+    ]
+    np.testing.assert_allclose(runs[1].u, runs[0].u, atol=1e-9)
+    assert (np.diff(runs[0].u, axis=0) != 0).any()
