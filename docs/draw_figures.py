@@ -29,6 +29,7 @@ from mampc.report.inspecting import inspection_figure
 from mampc.study import load_study, run_study
 
 IMAGES = Path(__file__).parent / "images"
+EXAMPLES = Path(__file__).parents[1] / "examples"
 SHOWN = {"noisy_overview", "noisy_moves-against-error"}
 PALE = "#dce9f2"
 
@@ -37,6 +38,8 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     save("procrastination", procrastination_figure())
     save("how-it-decides", loads_figure(deciding_runs()))
+    for name, figure in example_figures().items():
+        save(name, figure)
     for name, figure in export_figures().items():
         save(name, figure)
     result = run_study(load_study("quadruple-tank"), print)
@@ -44,6 +47,43 @@ def main() -> None:
     for drawing in study_figures(result):
         if drawing.name in SHOWN:
             save(drawing.name, drawing.figure)
+
+
+def example_figures():
+    """An output and an input of studies in `examples/`, two controllers next to each other."""
+    shown = {
+        "reference-filter": ("noise-free", "MPC", "MPC with a ramp"),
+        "on-off": ("noisy", "on/off", "six starts an hour"),
+        "sticking-valves": ("sticking", "price", "price, compensated"),
+    }
+    figures = {}
+    for name, (scenario, *controllers) in shown.items():
+        runs = run_study(load_study(EXAMPLES / f"{name}.toml"), print).runs[scenario]
+        with styled():
+            figure, axes = new_figure(2, 2, sharex=True, sharey="row")
+            for (top, bottom), controller in zip(axes.T, controllers, strict=True):
+                run = runs[controller]
+                minutes = run.t / 60.0
+                top.step(
+                    minutes,
+                    run.r[:, 0],
+                    where="post",
+                    color=BLACK,
+                    linestyle="--",
+                    linewidth=0.9,
+                    label="reference",
+                )
+                top.plot(minutes, run.y[:, 0], color=BLUE, label="output")
+                if not np.array_equal(run.position, run.u):
+                    bottom.step(minutes, run.position[:, 0], where="post", color=ORANGE, label="valve")
+                bottom.step(minutes, run.u[:, 0], where="post", color=VERMILION, label="input", linewidth=0.9)
+                top.set_title(controller)
+                bottom.set_xlabel("min")
+            axes[0, 0].set_ylabel(run.names.outputs[0])
+            axes[1, 0].set_ylabel(run.names.inputs[0])
+            legend_above(figure)
+        figures[name] = figure
+    return figures
 
 
 def export_figures():

@@ -135,3 +135,24 @@ def test_what_valves_would_not_execute_is_refused():
     other = loop(None).initial_state()
     with pytest.raises(mampc.MampcError, match="with valves"):
         loop(valves, 1.0).step(other, MODEL.y_op, MODEL.y_op)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_comes_inputs_stay_within_their_limits_and_states_go_to_text_and_back(seed):
+    rng, valves = np.random.default_rng(seed), mampc.Valves(band=[2.0, 0.5], jump=[1.0, 0.0])
+    regulator = loop(valves, [1.0, 0.0])
+    state = regulator.initial_state()
+    for _ in range(60):
+        spoilt = [np.nan, 1e300, -np.inf, *rng.uniform(0, 100, 3)]
+        told = {
+            "u_applied": rng.choice(spoilt, 2) if rng.random() < 0.3 else None,
+            "manual": rng.random(2) < 0.3 if rng.random() < 0.3 else None,
+            "limits": mampc.Limits(u_min=rng.uniform(0, 60, 2), u_max=60.0) if rng.random() < 0.3 else None,
+        }
+        y = MODEL.y_op + rng.standard_normal(2) + (np.nan if rng.random() < 0.2 else 0.0)
+        decision = regulator.step(state, y, MODEL.y_op + rng.uniform(-2, 2), **told)
+        low, high = regulator.controller.range_now(told["limits"])
+        assert (decision.u >= low).all()
+        assert (decision.u <= high).all()
+        state = decision.state
+        assert regulator.state_from_json(state.to_json()).to_json() == state.to_json()
