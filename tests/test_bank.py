@@ -5,6 +5,7 @@ import pytest
 
 import mampc
 from builders import identified_tank, tank_problem
+from mampc.study import parse_study, run_study, template
 
 TANK = mampc.plants.QuadrupleTank()
 PRICES = {"calm": 2.0, "brisk": 0.05}
@@ -75,6 +76,63 @@ def test_a_recorded_run_is_replayed_with_the_variants_that_decided(tmp_path):
     start = regulator.initial_state(ours.u_initial, ours.y[0])
     again = mampc.Regulator(mampc.ControllerBank(variants()))
     assert mampc.replay(again, start, recording) is None
+
+
+def test_many_loops_are_each_as_one_loop():
+    regulator, ours = run(variant=switched(), seed=1)
+    batch = mampc.simulate_batch(
+        TANK, regulator, reference(), seeds=[0, 1], noise=0.1, variant=switched(), progress=False
+    )
+    np.testing.assert_allclose(batch.u[1], ours.u, atol=1e-9)
+
+
+SHORT = template().replace("steps = 145", "steps = 40").replace("skip = 15", "skip = 0")
+STUDY = """
+[[scenarios]]
+name = "switched"
+noise = 0.1
+switches = [{ at = 30, variant = "calm" }, { at = 10, variant = "plain" }]
+
+[[controllers]]
+name = "calm"
+method = "exact"
+rules = { price = 2.0 }
+
+[[controllers]]
+name = "plain"
+method = "mpc"
+
+[[controllers]]
+name = "both"
+method = "bank"
+variants = ["calm", "plain"]
+"""
+
+
+def study(old="", new=""):
+    return parse_study(SHORT[: SHORT.index("[[scenarios]]")] + STUDY.replace(old, new, 1))
+
+
+def test_a_study_switches_where_its_scenario_says_so():
+    result = run_study(study())
+    decided = [decision.variant for decision in result.runs["switched"]["both"].decisions]
+    assert decided == ["calm"] * 10 + ["plain"] * 20 + ["calm"] * 10
+    assert {decision.variant for decision in result.runs["switched"]["plain"].decisions} == {None}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('variants = ["calm", "plain"]', 'variants = ["calm", "swift"]', "among calm, plain"),
+        ('variants = ["calm", "plain"]', "", "names of other controllers"),
+        ('variants = ["calm", "plain"]', 'variants = ["plain"]', "switches to calm, plain"),
+        ('method = "bank"', 'method = "mpc"', "names of other controllers"),
+        ('method = "bank"', 'method = "bank"\nrules = { price = 1.0 }', "neither rules nor settings"),
+    ],
+)
+def test_a_study_says_what_is_wrong_with_a_bank(old, new, expected):
+    with pytest.raises(mampc.StudyError, match=expected):
+        study(old, new)
 
 
 def test_states_are_kept_as_text():

@@ -101,6 +101,7 @@ def simulate_batch(
     loads: Sequence[Load] = (),
     valves: Valves | None = None,
     u_initial: Any = None,
+    variant: str | Sequence[str] | None = None,
     keep_decisions: bool = False,
     progress: bool | None = None,
 ) -> Batch:
@@ -116,6 +117,7 @@ def simulate_batch(
         reference, steps, noise, preview, u_initial: as in `simulate`.
         seeds: of noise and loads, one per loop; they give the number S of loops.
         input_disturbance, output_disturbance, measured_disturbance: as in `simulate`.
+        variant: as in `simulate`.
         loads, valves: as in `simulate`; loads are drawn for each loop with its seed.
         keep_decisions: keep every `Decision`; then regulators are stepped loop by loop, and memory grows with them.
         progress: as in `simulate`.
@@ -159,7 +161,7 @@ def simulate_batch(
         acting.append(
             acting_on(
                 plants[s], regulators[s], steps=steps, noise=noise, loads=loads, valves=valves, u_initial=u_initial,
-                **one,
+                variant=variant, **one,
             )
         )  # fmt: skip
     courses = [one.drawn(seed) for one, seed in zip(acting, seeds, strict=True)]

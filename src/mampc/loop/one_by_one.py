@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,7 +55,7 @@ def closed_loops(
         measured, decisions = y + noise[k], []
         position = np.empty_like(position)
         for s, (regulator, course) in enumerate(zip(regulators, courses, strict=True)):
-            told: dict[str, Any] = {"measured_disturbance": v[k, s]} if model.n_disturbances else {}
+            told = course.told(k, v[k, s] if model.n_disturbances else None)
             reference = course.reference[k : k + ahead[s]] if preview else course.reference[k]
             decision = regulator.step(states[s], measured[s], reference, **told)
             states[s], stem = decision.state, stems[s]

@@ -69,9 +69,9 @@ def simulate(
         plant, regulator, reference, steps=steps, noise=noise,
         input_disturbance=input_disturbance, output_disturbance=output_disturbance,
         measured_disturbance=measured_disturbance, loads=loads, valves=valves, u_initial=u_initial,
+        variant=variant,
     ).drawn(seed)  # fmt: skip
-    variants = _variants(variant, len(course))
-    return closed_loop(plant, regulator, course, preview=preview, variants=variants, progress=progress)
+    return closed_loop(plant, regulator, course, preview=preview, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +85,7 @@ class Course:
         v: measured disturbances, shape (T, d).
         u_initial: inputs before the first sample, shape (m,).
         stems: the valves at these inputs; None where inputs are as decided.
+        variants: of a `ControllerBank`, a name for each sample; None for its first.
     """
 
     reference: Array
@@ -94,6 +95,12 @@ class Course:
     v: Array
     u_initial: Array
     stems: Stems | None
+    variants: Sequence[str] | None
+
+    def told(self, k: int, v: Array | None) -> dict[str, Any]:
+        """What the regulator is told at a sample beside measurements and reference; v its measured disturbances."""
+        told: dict[str, Any] = {} if v is None else {"measured_disturbance": v}
+        return told if self.variants is None else told | {"variant": self.variants[k]}
 
     def __len__(self) -> int:
         return len(self.noise)
@@ -105,7 +112,7 @@ class Acting:
 
     Attributes:
         dt: sample time in seconds.
-        reference, u_initial, stems: as in `Course`.
+        reference, u_initial, stems, variants: as in `Course`.
         spread: standard deviation of the noise, shape (l,).
         at: disturbances by place, shapes (T, m), (T, l) and (T, d).
         loads: to be drawn.
@@ -118,6 +125,7 @@ class Acting:
     loads: Sequence[Load]
     u_initial: Array
     stems: Stems | None
+    variants: Sequence[str] | None
 
     def drawn(self, seed: int) -> Course:
         """With noise and loads of a seed."""
@@ -128,7 +136,14 @@ class Acting:
             at[place] = at[place] + load
         noise = self.spread * np.random.default_rng(seed).standard_normal((T, len(self.spread)))
         return Course(
-            self.reference, noise, at["input"], at["output"], at["measured"], self.u_initial, self.stems
+            self.reference,
+            noise,
+            at["input"],
+            at["output"],
+            at["measured"],
+            self.u_initial,
+            self.stems,
+            self.variants,
         )
 
 
@@ -145,6 +160,7 @@ def acting_on(
     loads: Sequence[Load],
     valves: Valves | None,
     u_initial: Any,
+    variant: str | Sequence[str] | None = None,
 ) -> Acting:
     """What the arguments of `simulate` say, checked."""
     if not isinstance(regulator, Regulator):
@@ -177,6 +193,7 @@ def acting_on(
     return Acting(
         dt=model.dt, reference=rows[np.minimum(np.arange(T + horizon), len(rows) - 1)], spread=spread, at=at,
         loads=loads, u_initial=start, stems=None if valves is None else valves.initial(start),
+        variants=_variants(variant, T),
     )  # fmt: skip
 
 
@@ -186,16 +203,12 @@ def closed_loop(
     course: Course,
     *,
     preview: bool,
-    variants: Sequence[str] | None = None,
     progress: bool | None,
 ) -> Run:
     """The loop sample by sample."""
     model, horizon = regulator.controller.problem.model, regulator.controller.problem.prediction_horizon
     T, start, v, r = len(course), course.u_initial, course.v, course.reference[: len(course)]
     motion = motion_of(plant, model.dt)
-    told: list[dict[str, Any]] = [{"measured_disturbance": now} if model.n_disturbances else {} for now in v]
-    for now, name in zip(told, variants or (), strict=False):
-        now["variant"] = name
     x, state = at_rest(plant, regulator, start, v[0])
     shape = (T, len(start))
     inputs, positions, outputs = np.empty(shape), np.empty(shape), np.empty((T, model.n_outputs))
@@ -206,7 +219,12 @@ def closed_loop(
             motion.output(x, np.concatenate([position + course.at_inputs[k], v[k]])) + course.at_outputs[k]
         )
         ahead = course.reference[k : k + horizon + 1] if preview else r[k]
-        decision = regulator.step(state, outputs[k] + course.noise[k], ahead, **told[k])
+        decision = regulator.step(
+            state,
+            outputs[k] + course.noise[k],
+            ahead,
+            **course.told(k, v[k] if model.n_disturbances else None),
+        )
         state, position = decision.state, decision.u
         inputs[k] = decision.u
         if stems is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError, StudyError, shown
-from mampc.controllers import MAMPC, MPC
+from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.loop.batch import Batch, simulate_batch
@@ -30,6 +30,7 @@ from mampc.rivals.registry import RIVALS, rival
 from mampc.study.cautions import cautions
 from mampc.study.plugins import make_plant
 from mampc.study.schema import (
+    BANK,
     ControllerTable,
     IdentificationTable,
     LoadTable,
@@ -148,7 +149,7 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
     if table.compensate and study.actuators is not None:
         valves = study.actuators.valves()
         table = _executed(table, valves, model.n_inputs)
-    controller = _controller(problem, table)
+    controller = _controller(problem, table, study.controllers)
     counts = study.estimator.value_of_information and type(controller) is MAMPC
     smooth = None if table.reference_filter is None else table.reference_filter.made()
     try:
@@ -200,7 +201,13 @@ def run_seeds(
     acting = _acting(study, prepared, scenario)
     try:
         return simulate_batch(
-            plant, regulator, seeds=seeds, preview=study.reference.preview, progress=False, **acting
+            plant,
+            regulator,
+            seeds=seeds,
+            preview=study.reference.preview,
+            progress=False,
+            variant=_variants(study, scenario, regulator),
+            **acting,
         )
     except MampcError as error:
         raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
@@ -213,9 +220,21 @@ def _course(
     plant = _plant(study, prepared, scenario, scenario.seed)
     acting = _acting(study, prepared, scenario)
     try:
-        return plant, acting_on(plant, regulator, steps=None, **acting).drawn(scenario.seed)
+        return plant, acting_on(
+            plant, regulator, steps=None, variant=_variants(study, scenario, regulator), **acting
+        ).drawn(scenario.seed)
     except MampcError as error:
         raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
+
+
+def _variants(study: Study, scenario: ScenarioTable, regulator: Regulator) -> list[str] | None:
+    """Which variant of a bank decides each sample; None for other controllers, which have none."""
+    if not isinstance(regulator.controller, ControllerBank):
+        return None
+    names = [regulator.controller.usual] * study.steps
+    for switch in sorted(scenario.switches, key=lambda switch: switch.at):
+        names[switch.at :] = [switch.variant] * len(names[switch.at :])
+    return names
 
 
 def _plant(study: Study, prepared: Prepared, scenario: ScenarioTable, seed: int) -> Plant | StateSpace:
@@ -313,8 +332,15 @@ def _record(
     return excite(plant, signal, dt=dt, noise=table.noise, seed=table.seed, x0=rest)
 
 
-def _controller(problem: TrackingProblem, table: ControllerTable) -> Controller:
+def _controller(
+    problem: TrackingProblem, table: ControllerTable, tables: Sequence[ControllerTable]
+) -> Controller:
     try:
+        if table.method == BANK:
+            named = {other.name: other for other in tables}
+            return ControllerBank(
+                {name: _controller(problem, named[name], tables) for name in table.variants}
+            )
         if table.method in RIVALS:
             around = None if table.around == "mpc" else _sparse(problem, table, table.around, {})
             return rival(table.method, problem, table.settings, around=around)

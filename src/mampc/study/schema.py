@@ -167,6 +167,7 @@ class ReferenceTable(Table):
     changes: list[ChangeTable] = []
 
 
+BANK = "bank"  # the method of a `ControllerBank`
 LOADS = {
     "steps": loads.Steps, "random_steps": loads.RandomSteps, "random_walk": loads.RandomWalk,
     "coloured": loads.Coloured, "sinusoid": loads.Sinusoid,
@@ -240,6 +241,13 @@ class MismatchTable(Table):
     dead_time: Share = 0.0
 
 
+class SwitchTable(Table):
+    """From a sample on, another variant of banks of controllers decides."""
+
+    at: Whole
+    variant: Word
+
+
 class ScenarioTable(Table):
     name: Name
     noise: Values = 0.0
@@ -251,6 +259,7 @@ class ScenarioTable(Table):
     loads: list[LoadTable] = []
     valves: ValvesTable | None = None
     mismatch: MismatchTable | None = None
+    switches: list[SwitchTable] = []
 
 
 class ActuatorsTable(Table):
@@ -355,11 +364,20 @@ class ControllerTable(Table):
     reference_filter: ReferenceFilterTable | None = None
     compensate: bool = False
     published: PublishedTable | None = None
+    variants: list[Word] = []
 
     @model_validator(mode="after")
     def _rules_where_needed(self) -> ControllerTable:
         if self.compensate and self.method not in METHODS:
             raise ValueError(f"compensate with one of {', '.join(METHODS)} only; received {self.method!r}")
+        if (self.method == BANK) != bool(self.variants):
+            raise ValueError(f"variants, names of other controllers, with the method {BANK!r} and no other")
+        if self.method == BANK:
+            if self.rules is not None or self.settings:
+                raise ValueError(
+                    f"neither rules nor settings for the method {BANK!r}: its variants have them"
+                )
+            return self
         if self.method in RIVALS:
             return self._as_rival()
         if self.around != "mpc":
@@ -482,4 +500,18 @@ class Study(Table):
             names = [file_word(table.name) for table in getattr(self, kind)]
             if len(set(names)) != len(names):
                 raise ValueError(f"{kind} with names that differ in letters or digits; received {names}")
+        self._check_banks()
         return self
+
+    def _check_banks(self) -> None:
+        alone = [table.name for table in self.controllers if table.method in ("mpc", *METHODS)]
+        asked = {switch.variant for scenario in self.scenarios for switch in scenario.switches}
+        banks = [table for table in self.controllers if table.method == BANK]
+        if asked and not banks:
+            raise ValueError(f"switches of scenarios with a controller of the method {BANK!r}; received none")
+        for table in banks:
+            if not set(table.variants) <= set(alone) or not asked <= set(table.variants):
+                raise ValueError(
+                    f"variants of {table.name!r} among {', '.join(alone)}, with all that scenarios switch to; "
+                    f"received {', '.join(table.variants)}, and switches to {', '.join(sorted(asked)) or 'none'}"
+                )
