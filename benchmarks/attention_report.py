@@ -41,7 +41,13 @@ def write(results: Path) -> None:
     text = page.read_text(encoding="utf-8")
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     figure = "![Moves of the exact price over those of the best rival](images/attention.svg)"
-    parts = [made_by(content["made by"]), figure, standing(cells, methods), by_load(cells, methods)]
+    parts = [
+        made_by(content["made by"]),
+        *unmeasured(cells, methods),
+        figure,
+        standing(cells, methods),
+        by_load(cells, methods),
+    ]
     parts += [by_ratio(cells, methods), losses(cells, methods), by_cell(cells, methods)]
     if any(name in cell for cell in cells.values() for name in LIMITS):
         parts.append(limits(cells))
@@ -66,10 +72,17 @@ def cells_of(rows: list[dict[str, Any]]) -> Cells:
 
 def made_by(how: dict[str, Any]) -> str:
     return (
-        f"`{how['command']}`, {how['minutes of one core']:g} minutes of one core; {how['samples']} samples, "
+        f"`{how['command']}`, about {how['minutes of one core']:.0f} minutes of one core; {how['samples']} samples, "
         f"{how['scenarios to tune in']} scenarios to tune in, {how['scenarios to measure in']} others to measure in; "
         f"Python {how['python']}, NumPy {how['numpy']}, {how['machine']}."
     )
+
+
+def unmeasured(cells: Cells, methods: list[str]) -> list[str]:
+    """What a run that was cut short has not come to."""
+    missing = {name: sum(name not in cell for cell in cells.values()) for name in methods}
+    told = ", ".join(f"{name} in {count} of {len(cells)} cells" for name, count in missing.items() if count)
+    return [f"Not measured: {told}."] if told else []
 
 
 def best_rival(cell: dict[str, dict[float, Moves]], ratio: float = RATIO) -> tuple[str, Moves]:
@@ -119,15 +132,10 @@ def by_load(cells: Cells, methods: list[str]) -> str:
         "|---|" + "---|" * (len(kinds) + 1),
     ]
     for method in methods:
+        groups = [[c for (_, load), c in cells.items() if kind in (None, load)] for kind in [*kinds, None]]
         row = [
-            mean(
-                [
-                    c[method][RATIO].value
-                    for (_, load), c in cells.items()
-                    if method in c and kind in (None, load)
-                ]
-            )
-            for kind in [*kinds, None]
+            mean([c[method][RATIO].value for c in group]) if all(method in c for c in group) else ""
+            for group in groups
         ]
         lines.append("| " + " | ".join([method, *row]) + " |")
     return "\n".join(lines)
@@ -141,8 +149,8 @@ def by_ratio(cells: Cells, methods: list[str]) -> str:
         "| method | " + " | ".join(f"{ratio:g} x MPC's error" for ratio in RATIOS) + " |",
         "|---|" + "---|" * len(RATIOS),
     ]
-    for method in methods:
-        row = [mean([c[method][ratio].value for c in cells.values() if method in c]) for ratio in RATIOS]
+    for method in [name for name in methods if all(name in cell for cell in cells.values())]:
+        row = [mean([c[method][ratio].value for c in cells.values()]) for ratio in RATIOS]
         lines.append("| " + " | ".join([method, *row]) + " |")
     return "\n".join(lines)
 
