@@ -19,6 +19,7 @@ import json
 import platform
 import sys
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,12 @@ def measured(case: Case, kind: str, method: str, structure: tuple, knobs: Any, s
     ]
 
 
+@cache
+def baseline_of(name: str, kind: str, seeds: range) -> Point:
+    """Plain MPC."""
+    return measured(cases()[name], kind, *BASELINE, [1.0], seeds)[0]
+
+
 def knob_at(points: list[Point], baseline: Point) -> float:
     """Where a method reaches the error that it is tuned for, errors rising with the knob."""
     error = np.maximum.accumulate([p.error.mean() / baseline.error.mean() for p in points])
@@ -106,14 +113,14 @@ def cell(name: str, kind: str, method: str, quick: bool) -> dict:
     """One method on one plant under one kind of load: tuned, then measured in other scenarios."""
     case, began = cases()[name], time.process_time()
     if method in LIMITS:
-        [baseline] = measured(case, kind, *BASELINE, [1.0], SCENARIOS)
+        baseline = baseline_of(name, kind, SCENARIOS)
         around = load_of(kind, case), reference_of(case), 0.1 / per_input(case) ** 2
         return row(
             name, kind, method, None, None, [baseline, *limit(method, case, kind, *around, baseline)], began
         )
     knobs, about = (KNOB[::2], ABOUT[::4]) if quick else (KNOB, ABOUT)
     tuning, evaluation = (TUNING[:1], EVALUATION[:2]) if quick else (TUNING, EVALUATION)
-    [base], [baseline] = (measured(case, kind, *BASELINE, [1.0], seeds) for seeds in (tuning, evaluation))
+    base, baseline = (baseline_of(name, kind, seeds) for seeds in (tuning, evaluation))
     structures = METHODS[method]
     each = [measured(case, kind, method, structure, knobs, tuning) for structure in structures]
     at = [moves_at(own, base, RATIO).value for own in each]

@@ -4,9 +4,9 @@ Clairvoyant: knows the whole record, loads and references included, and chooses 
 knows at each sample state, plant and load exactly as they are, and what the load will be on average; chooses all later
 moves and makes the first. References change as unexpectedly for it as for the controllers.
 
-Both have a price a move and search locally: single moves are added, dropped and shifted until nothing gets better. So
-the true limits may be lower still. Nonlinear plants are predicted by their linear model and what it missed, which the
-clairvoyant repeats about each plan.
+Both have a price a move and search locally: single moves are added, dropped and shifted until nothing gets better, and
+an input whose plan would leave its limits is held in that plan. So the true limits may be lower still. Nonlinear
+plants are predicted by their linear model and what it missed, which the clairvoyant repeats about each plan.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from mampc.systems.state_space import StateSpace
 
 AHEAD, AFTER = 60, 20  # samples that the non-anticipative plans moves in, and on which errors count beyond
 ROUNDS = 2  # of the clairvoyant about its plan, on a nonlinear plant
-LIGHT = 0.003  # weight of moves, as a share of plain MPC's
-PRICES = np.geomspace(1.0, 1e-3, 13)  # over the error of plain MPC in the whole record
+LIGHT = 1.0  # weight of moves, times plain MPC's
+PRICES = np.geomspace(10.0, 1e-3, 17)  # over the error of plain MPC in the whole record
 ENOUGH = 1.1  # times the error of plain MPC: below it no lower price is tried
 SCENARIOS = range(4)  # seeds
 
@@ -34,6 +34,23 @@ class Search:
 
     def __init__(self, G: np.ndarray, R: np.ndarray) -> None:
         self._G, self._B = G, G.T @ G + np.diag(R)
+        self._held = np.zeros(len(R), dtype=bool)
+
+    def within(
+        self, target: np.ndarray, price: float, support: list[int], u: np.ndarray, limits: Any
+    ) -> tuple[np.ndarray, list[int]]:
+        """`moves` that keep inputs, now u (m,), within limits; one that would not stay within them is held."""
+        self._held = np.zeros(len(self._B), dtype=bool)
+        for _ in range(len(u) + 1):
+            d, support = self.moves(target, price, [j for j in support if not self._held[j]])
+            levels = u + d.reshape(-1, len(u)).cumsum(axis=0)
+            beyond = ((levels > np.add(limits.u_max, 1e-9)) | (levels < np.subtract(limits.u_min, 1e-9))).any(
+                axis=0
+            )
+            if not beyond.any():
+                break
+            self._held |= np.tile(beyond, len(d) // len(u))
+        return d, support
 
     def moves(self, target: np.ndarray, price: float, support: list[int]) -> tuple[np.ndarray, list[int]]:
         """d, and where it is not zero; `support` is where to start."""
@@ -66,6 +83,7 @@ class Search:
         left = np.maximum(np.diag(B) - np.einsum("ij,ij->i", across @ inverse, across), 1e-9 * np.diag(B))
         worth = (c - across @ values) ** 2 / left
         worth[chosen] = -np.inf
+        worth[self._held] = -np.inf
         return values, worth, values**2 / np.diag(inverse)
 
     def _shifted(self, c: np.ndarray, chosen: list[int], loss: np.ndarray, price: float) -> list[int] | None:
@@ -159,7 +177,8 @@ def clairvoyant(loops: Loops, weight: np.ndarray, prices: np.ndarray, enough: fl
         for _ in range(1 if loops.is_linear else ROUNDS):
             missing = ((loops.reference - y) / loops.case.noise).reshape(S, -1)
             for s in range(S):
-                d[s], supports[s] = search.moves(missing[s] + G @ d[s], price, supports[s])
+                whole = missing[s] + G @ d[s]
+                d[s], supports[s] = search.within(whole, price, supports[s], loops.u, loops.limits)
             planned = loops.u + d.reshape(S, T, m).cumsum(axis=1)
             u = np.clip(planned, loops.limits.u_min, loops.limits.u_max)
             y = loops.outputs(u)
@@ -200,7 +219,7 @@ def non_anticipative(
             target = ((loops.reference[k] - loops.y_rest - free) / loops.case.noise).reshape(S, -1)
             for s in range(S):
                 earlier = [j - m for j in supports[s] if j >= m]
-                d, supports[s] = search.moves(target[s], price, earlier)
+                d, supports[s] = search.within(target[s], price, earlier, u[s], loops.limits)
                 u[s] = np.clip(u[s] + d[:m], loops.limits.u_min, loops.limits.u_max)
             decided[:, k] = u
             after = loops.motion.move(x, loops.applied(u, k))
