@@ -2,6 +2,7 @@
 
     python benchmarks/zones.py            # prints the figures of docs/methods.md; about two minutes
     python benchmarks/zones.py --figure   # and draws docs/images/zones.svg
+    python benchmarks/zones.py --times    # only how long steps take, against those with set points, on the tank
 
 A first-order plant, its model exact, with measurement noise sigma and loads at its output that jump at random. Outputs
 are to be within two sigma of their reference. Set point, zones of that width and of half of it, each with a price per
@@ -11,6 +12,7 @@ move, over the same seeds; the price goes through the values of `PRICES`.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +22,7 @@ from rich.progress import track
 from rich.table import Table
 
 import mampc
+from measuring import closed_loop, interleaved, steps_of, tank_problem
 
 SIGMA = 0.1
 WIDTH = 2 * SIGMA
@@ -92,12 +95,28 @@ def draw(fronts: dict[str, list[Outcome]]) -> None:
         figure.savefig(FIGURE)
 
 
+def times() -> None:
+    """Steps with zones against steps with set points, on the samples of the loop with zones."""
+    point, rules = tank_problem(), mampc.MoveRules(price=1.0)
+    zone = replace(point, zone_below=2 * SIGMA, zone_above=2 * SIGMA)
+    for name, made in (("MPC", mampc.MPC), ("exact price", lambda problem: mampc.MAMPC(problem, rules))):
+        with_zone, with_point = made(zone), made(point)
+        asked = closed_loop(with_zone)
+        blocks = [(steps_of(with_zone, asked), steps_of(with_point, asked)) for _ in range(3)]
+        found = interleaved(blocks)
+        print(f"{name}: {found} with set points, {found.ratio:.1f} times as long")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--figure", action="store_true", help="draw docs/images/zones.svg as well")
+    parser.add_argument("--times", action="store_true", help="only compare times of steps")
     arguments = parser.parse_args()
+    if arguments.times:
+        times()
+        return
     kinds = {
         "set point": {},
         "zone of two sigma": {"zone_below": WIDTH, "zone_above": WIDTH},

@@ -24,6 +24,7 @@ from mampc.methods.exact.nodes import Nodes, lift, renewed, root_of, trimmed, va
 from mampc.methods.exact.relaxation import Multipliers, Relaxation
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.exact.terms import Squares
+from mampc.methods.exact.zone_search import search_zones
 from mampc.methods.local_search import LocalSearch
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
@@ -77,7 +78,7 @@ class PatternTree:
         if not (allowance.left > 0 and len(problem.order)):
             return np.inf
         if self._zoned:
-            return self._search_zones(problem, solver)
+            return search_zones(problem, solver, self._local)
         limited = bool(sample.margins.min(initial=np.inf) < 0)
         if limited or self._admissible.priced:
             self._relax_root(problem)
@@ -90,17 +91,6 @@ class PatternTree:
         if found is not None and found.active:
             terms.add(found)
         return _BatchSearch(problem).run()
-
-    def _search_zones(self, problem: SampleProblem, solver: PatternSolver) -> float:
-        """The search where outputs have zones, from what a local search finds with set points in place of these."""
-        if problem.terms.rest[0] >= problem.cutoff:
-            return np.inf
-        sample, plain = problem.sample, self._squares.condensed.plain
-        multipliers = plain.solve(sample.moves, sample.lower, sample.upper).multipliers
-        if multipliers is not None:
-            f, _ = self._squares.condensed.relaxed_limits(sample, multipliers)
-            self._local.offer(solver, sample, f, problem.allowance, problem.best, problem.deadline)
-        return Branching(problem).run()
 
     def _relax_root(self, problem: SampleProblem) -> None:
         """Bound everything with limits and prices as a relaxed program has them, and try its moves."""
