@@ -126,6 +126,7 @@ def test_a_study_switches_where_its_scenario_says_so():
         ('variants = ["calm", "plain"]', 'variants = ["calm", "swift"]', "among calm, plain"),
         ('variants = ["calm", "plain"]', "", "names of other controllers"),
         ('variants = ["calm", "plain"]', 'variants = ["plain"]', "switches to calm, plain"),
+        ('method = "mpc"', 'method = "mpc"\nreference_filter = { rate = 1.0 }', "a variant of a bank"),
         ('method = "bank"', 'method = "mpc"', "names of other controllers"),
         ('method = "bank"', 'method = "bank"\nrules = { price = 1.0 }', "neither rules nor settings"),
     ],

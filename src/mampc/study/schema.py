@@ -509,6 +509,12 @@ class Study(Table):
         banks = [table for table in self.controllers if table.method == BANK]
         if asked and not banks:
             raise ValueError(f"switches of scenarios with a controller of the method {BANK!r}; received none")
+        for table in self.controllers:
+            own = table.compensate or table.reference_filter is not None
+            if own and any(table.name in bank.variants for bank in banks):
+                raise ValueError(
+                    f"neither compensate nor a reference_filter of {table.name!r}, a variant of a bank"
+                )
         for table in banks:
             if not set(table.variants) <= set(alone) or not asked <= set(table.variants):
                 raise ValueError(
