@@ -1,6 +1,6 @@
 """Zones against set points: moves at equal time outside the zone.
 
-    python benchmarks/zones.py            # prints the figures of docs/methods.md; about two minutes
+    python benchmarks/zones.py            # prints the figures of docs/methods.md; about a minute
     python benchmarks/zones.py --figure   # and draws docs/images/zones.svg
     python benchmarks/zones.py --times    # only how long steps take, against those with set points, on the tank
 
@@ -89,8 +89,9 @@ def draw(fronts: dict[str, list[Outcome]]) -> None:
                 [100 * o.outside for o in outcomes], [o.moves for o in outcomes],
                 xerr=[100 * o.error for o in outcomes], marker="o", label=name,
             )  # fmt: skip
-        axes.set(xlabel="time outside the zone, %", ylabel=f"moves in {STEPS} samples", yscale="log")
-        axes.yaxis.set_major_formatter("{x:g}")
+        axes.set(xlabel="time outside two sigma, %", ylabel=f"moves in {STEPS} samples", yscale="log")
+        axes.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+        axes.minorticks_off()
         axes.legend(frameon=False)
         figure.savefig(FIGURE)
 
