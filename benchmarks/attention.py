@@ -149,12 +149,16 @@ def row(
     }  # fmt: skip
 
 
+def name_of(quick: bool) -> str:
+    return "attention-quick" if quick else "attention"
+
+
 def journals_of(quick: bool, again: list[str]) -> dict[str, Journal]:
     """What is finished of every method, by plant and load."""
     journals = {}
     for method, structures in EVERYTHING.items():
         constants = f"{quick} {TUNING} {EVALUATION} {STEPS} {KNOB} {ABOUT} {RATIO} {method} {structures}"
-        path = RESULTS / "attention" / f"{method.replace(', ', '-').replace(' ', '-')}.jsonl"
+        path = RESULTS / name_of(quick) / f"{method.replace(', ', '-').replace(' ', '-')}.jsonl"
         path.parent.mkdir(parents=True, exist_ok=True)
         if method in again:
             path.unlink(missing_ok=True)
@@ -196,7 +200,7 @@ def collect(journals: dict[str, Journal], quick: bool) -> None:
     }  # fmt: skip
     lines = ",\n".join(json.dumps(row) for row in rows)
     text = f'{{"made by": {json.dumps(made_by, indent=1)},\n"cells": [\n{lines}\n]}}\n'
-    (RESULTS / "attention.json").write_text(text, encoding="utf-8")
+    (RESULTS / f"{name_of(quick)}.json").write_text(text, encoding="utf-8")
 
 
 def main() -> None:
@@ -215,10 +219,15 @@ def main() -> None:
     journals = journals_of(given.quick, given.again)
     if not given.draw:
         run(journals, given.quick, given.jobs, given.plants, given.methods)
-    collect(journals, given.quick)
+    if any(journal.done for journal in journals.values()):
+        collect(journals, given.quick)
     import attention_report
 
-    attention_report.write(RESULTS / "attention.json")
+    results = RESULTS / f"{name_of(given.quick)}.json"
+    if given.quick:
+        print(attention_report.told(results)[0])
+    else:
+        attention_report.write(results)
 
 
 if __name__ == "__main__":

@@ -34,12 +34,19 @@ Cells = dict[tuple[str, str], dict[str, dict[float, Moves]]]  # plant and load -
 
 def write(results: Path) -> None:
     """Put the results into docs/comparison.md, and draw the heat map."""
-    content = json.loads(results.read_text(encoding="utf-8"))
-    cells = cells_of(content["cells"])
-    methods = list(dict.fromkeys(name for cell in cells.values() for name in cell if name not in LIMITS))
+    body, cells, methods = told(results)
     page = DOCS / "comparison.md"
     text = page.read_text(encoding="utf-8")
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
+    page.write_text(f"{text[:start]}\n\n{body}\n\n{text[end:]}", encoding="utf-8")
+    draw(cells, methods)
+
+
+def told(results: Path) -> tuple[str, Cells, list[str]]:
+    """The results in words and tables; by plant and load; and the methods in them."""
+    content = json.loads(results.read_text(encoding="utf-8"))
+    cells = cells_of(content["cells"])
+    methods = list(dict.fromkeys(name for cell in cells.values() for name in cell if name not in LIMITS))
     figure = "![Moves of the exact price over those of the best rival](images/attention.svg)"
     parts = [
         made_by(content["made by"]),
@@ -51,9 +58,7 @@ def write(results: Path) -> None:
     parts += [by_ratio(cells, methods), losses(cells, methods), by_cell(cells, methods)]
     if any(name in cell for cell in cells.values() for name in LIMITS):
         parts.append(limits(cells))
-    body = "\n\n".join(parts)
-    page.write_text(f"{text[:start]}\n\n{body}\n\n{text[end:]}", encoding="utf-8")
-    draw(cells, methods)
+    return "\n\n".join(parts), cells, methods
 
 
 def cells_of(rows: list[dict[str, Any]]) -> Cells:
