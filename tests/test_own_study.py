@@ -12,11 +12,13 @@ from typer.testing import CliRunner
 import mampc
 from mampc import StateSpace
 from mampc.cli import app
+from mampc.program.condensing import CondensedQP
 from mampc.study import load_study, parse_study, template
-from mampc.study.own import own_study
+from mampc.study.own import draft, own_study
 from mampc.study.running import run_study
 from mampc.systems.evidence import Evidence
 from mampc.systems.noise import Noise
+from mampc.systems.properties import properties
 
 lags = StateSpace.from_first_order
 MODELS = {
@@ -54,6 +56,16 @@ def test_it_runs_at_once_and_its_price_pays(kind, tmp_path):
     still = np.mean(np.sum((runs["MPC"].r - MODELS[kind].y_op) ** 2, axis=1))
     assert mpc.tracking_error < 0.8 * still
     assert price.tracking_error < 0.9 * still
+
+
+def test_a_level_that_first_answers_the_wrong_way_gets_a_stable_loop():
+    model = StateSpace([[1.0, 0.0], [0.0, 0.9]], [[0.026], [-0.321]], [[1.0, 1.0]], None, 10.0, 50.0, 20.0)
+    plan = draft(model, properties(model))
+    assert np.abs(CondensedQP(plan.problem).closed_loop_poles()).max() < 1
+    run = mampc.simulate(
+        model, mampc.Regulator(mampc.MPC(plan.problem)), model.y_op + plan.changes[0], steps=2000
+    )
+    assert abs(run.y[-1] - run.r[-1]) < 0.01 * np.abs(plan.changes).max()
 
 
 @pytest.mark.parametrize("units", [1e-8, 1e-3, 1e6])

@@ -164,14 +164,19 @@ def _reach(change: Array, down: Array, up: Array) -> float:
 
 
 def _stable(problem: TrackingProblem) -> TrackingProblem:
-    """With moves that cost more, as far as it takes a closed loop that is stable without limits."""
+    """With moves that cost more and a longer horizon, as far as it takes a closed loop that is stable without limits.
+
+    A plant that first answers in the wrong direction wants a horizon that sees the right one.
+    """
+    longest = min(LONGEST_HORIZON, MOST_PREDICTIONS // problem.model.n_outputs)
     for _ in range(8):
         if np.abs(CondensedQP(problem).closed_loop_poles()).max() < 1 + 1e-6:
             break
+        horizon = max(problem.prediction_horizon, min(int(1.5 * problem.prediction_horizon), longest))
         problem = TrackingProblem(
-            problem.model, prediction_horizon=problem.prediction_horizon, control_horizon=problem.control_horizon,
+            problem.model, prediction_horizon=horizon, control_horizon=problem.control_horizon,
             output_weight=problem.output_weight, move_weight=_rounded(4 * problem.move_weight),
-            limits=problem.limits, tail_horizon=problem.tail_horizon,
+            limits=problem.limits, tail_horizon=float(horizon) if problem.tail_horizon else 0.0,
         )  # fmt: skip
     return problem
 
