@@ -45,7 +45,8 @@ class Decision(NamedTuple):
     Attributes:
         u: inputs to apply now, shape (m,); always finite and within the input limits.
         plan: planned inputs, shape (nc, m): the last inputs applied and the sum of `changes`. Its first row is `u`, but
-            for inputs in manual that are held outside their limits: these are planned where they are.
+            for inputs in manual that are held outside their limits: these are planned where they are. Where a
+            `Regulator` knows its valves, plan and changes are those of the stems.
         changes: planned moves du, shape (nc, m); with an exact pattern (polish) zero off it.
         status: how the decision came about.
         objective: cost of the plan: tracking over i = 0..np, move weights over j = 0..nc-1, output-limit
