@@ -2,7 +2,8 @@
 
 Clairvoyant: knows the whole record, loads and references included, and chooses all moves at once. Non-anticipative:
 knows at each sample state, plant and load exactly as they are, and what the load will be on average; chooses all later
-moves and makes the first. References change as unexpectedly for it as for the controllers.
+moves and makes the first. References change as unexpectedly for it as for the controllers. How far it plans is the
+better one of two: long plans suit loads that stay, short ones loads that wander.
 
 Both have a price a move and search locally: single moves are added, dropped and shifted until nothing gets better, and
 an input whose plan would leave its limits is held in that plan. So the true limits may be lower still. Nonlinear
@@ -21,9 +22,9 @@ from mampc.loop.motion import motions_of
 from mampc.loop.simulation import Course, acting_on
 from mampc.systems.state_space import StateSpace
 
-AHEAD, AFTER = 60, 20  # samples that the non-anticipative plans moves in, and on which errors count beyond
+HORIZONS = (10, 60)  # samples that the non-anticipative plans moves in; errors count for a third more
 ROUNDS = 2  # of the clairvoyant about its plan, on a nonlinear plant
-LIGHT = 1.0  # weight of moves, times plain MPC's
+LIGHT = 0.1  # weight of moves, times plain MPC's
 PRICES = np.geomspace(10.0, 1e-3, 17)  # over the error of plain MPC in the whole record
 ENOUGH = 1.1  # times the error of plain MPC: below it no lower price is tried
 SCENARIOS = range(4)  # seeds
@@ -162,7 +163,9 @@ def limit(
     enough = ENOUGH * float(baseline.error.mean())
     if name == "clairvoyant":
         return clairvoyant(loops, weight, prices, enough)
-    return non_anticipative(loops, kind, weight, prices, enough)
+    return [
+        point for ahead in HORIZONS for point in non_anticipative(loops, kind, weight, prices, enough, ahead)
+    ]
 
 
 def clairvoyant(loops: Loops, weight: np.ndarray, prices: np.ndarray, enough: float) -> list[Point]:
@@ -189,12 +192,12 @@ def clairvoyant(loops: Loops, weight: np.ndarray, prices: np.ndarray, enough: fl
 
 
 def non_anticipative(
-    loops: Loops, kind: str, weight: np.ndarray, prices: np.ndarray, enough: float
+    loops: Loops, kind: str, weight: np.ndarray, prices: np.ndarray, enough: float, ahead: int
 ) -> list[Point]:
     """Sample by sample, with everything known that has happened."""
     model, T, S = loops.model, loops.T, len(loops.courses)
-    m, l, rows = model.n_inputs, model.n_outputs, AHEAD + AFTER
-    search = Search(loops.effect(rows, AHEAD), np.tile(LIGHT * weight, AHEAD))
+    m, l, rows = model.n_inputs, model.n_outputs, ahead + ahead // 3
+    search = Search(loops.effect(rows, ahead), np.tile(LIGHT * weight, ahead))
     B, D = model.B[:, :m], model.D[:, :m]
     powers = [np.eye(model.n_states)]
     for _ in range(rows):
