@@ -136,7 +136,8 @@ def test_a_late_actuator_that_is_told_is_no_worse_than_one_that_is_not(either_es
     if rules == "budget":
         assert fullest_window(applied[30:]) <= 2
     if rules != "mpc":
-        assert (np.diff(applied[60:100]) != 0).sum() <= (16 if rules == "budget" else 1)
+        most = 16 if rules == "budget" else 2  # with a price and not told, the load bank makes up to 9
+        assert (np.diff(applied[60:100]) != 0).sum() <= most
 
 
 def memory_after(told, decided=(0.0, 10.0, 16.0, 21.0), by_hand=None):
