@@ -213,7 +213,8 @@ def limits(cells: Cells) -> str:
     names = (ours, *LIMITS)
     both = [cell for cell in cells.values() if all(name in cell for name in names[:2])]
     pairs = [(cell[ours][RATIO].value, cell[LIMITS[0]][RATIO].value) for cell in both]
-    ratio = np.exp(np.mean([np.log(own / limit) for own, limit in pairs if np.isfinite(own + limit)]))
+    pairs = [pair for pair in pairs if np.isfinite(sum(pair))]
+    ratio = np.exp(np.mean([np.log(own / limit) for own, limit in pairs]))
     lines = [
         f"{ours} makes {ratio:.1f} times the moves of the non-anticipative, geometric mean over {len(pairs)} cells.",
         "",
