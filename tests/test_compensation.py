@@ -8,9 +8,11 @@ import pytest
 import mampc
 from builders import same_decision, tank_model, tank_problem
 from referees import moved
+from seeds import examples
 
 STICKING = {"play": (2.0, 0.0), "both": (2.0, 1.0), "stiction": (2.0, 2.0)}
 each_valve = pytest.mark.parametrize(("band", "jump"), STICKING.values(), ids=STICKING)
+SAMPLES = examples(40, quick=14)  # least sizes cost time
 MODEL = tank_model()
 PROBLEM = tank_problem(MODEL, tail_horizon=10.0, move_weight=0.03)
 
@@ -99,7 +101,7 @@ def test_units_decide_nothing(band, jump):
         problem = tank_problem(model, tail_horizon=10.0, move_weight=0.03 / unit**2, limits=limits)
         valves = mampc.Valves(band=band * unit, jump=jump * unit)
         regulator = loop(valves, jump * unit, problem=problem)
-        reference = mampc.steps(40, MODEL.y_op, [(5, MODEL.y_op + 1.0)])
+        reference = mampc.steps(SAMPLES, MODEL.y_op, [(5, MODEL.y_op + 1.0)])
         run = mampc.simulate(model, regulator, reference, valves=valves, input_disturbance=3.0 * unit)
         inputs.append(run.u / unit)
     np.testing.assert_allclose(*inputs, atol=1e-6)

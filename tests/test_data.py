@@ -127,12 +127,12 @@ def test_a_given_step_needs_no_time_column_and_contradicts_none(tmp_path):
         ("u,y\n1,2\n3,4\n", "expected a column of times; .* pass the sample time"),
         (
             "time,u,y\n0,1,2\n1,two,3\n",
-            "expected consecutive rows with a number in every column, received none",
+            "expected consecutive rows with a number in every column, received numbers in 1 of u, 2 of y in 2 rows",
         ),
         ("time,u,y\n0,1,2\n1,2 m,3\n", "expected a number in row 3, column 'u', received '2 m'"),
         (
             "time,u,y\n0,1,2\n\n\n1,2,\n",
-            "expected consecutive rows with a number in every column, received none",
+            "expected consecutive rows with a number in every column, received numbers in 2 of u, 1 of y in 2 rows",
         ),
         ("time,u,y\n0,1,2\n1,2,3\n3,4,5\n", "expected an evenly increasing time column"),
         ("time,u,y\n0,1,2\n0,2,3\n", "expected a time for each sample, .* first in row 3"),
