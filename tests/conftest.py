@@ -1,4 +1,4 @@
-"""Every optimal solve of every test is checked for its optimality conditions."""
+"""Optimal solves of every test are checked for their optimality conditions: one of four, or with `make deep` all."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections import Counter
-from itertools import islice
+from itertools import count, islice
 
 import numpy as np
 import pytest
@@ -37,6 +37,7 @@ settings.register_profile(
     phases=list(Phase),
 )
 
+SOLVES = count()  # numbers the optimal solves of a process
 TOLERANCE = 1e-8  # relative to the sizes of the data
 
 
@@ -59,12 +60,12 @@ def certify(program, f, lower, upper, solution):
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _every_optimal_solve_is_certified():
+def _optimal_solves_are_certified():
     solve = DaqpSolver.solve
 
     def certified(self, f, lower, upper):
         solution = solve(self, f, lower, upper)
-        if solution.status is QPStatus.OPTIMAL:
+        if solution.status is QPStatus.OPTIMAL and next(SOLVES) % examples(1, quick=4) == 0:
             certify(self.program, f, lower, upper, solution)
         return solution
 

@@ -89,7 +89,7 @@ def delayed_record(delays, time_constants, seed, *, noise=0.05, samples=2500, un
 
 
 @pytest.mark.parametrize("units", UNITS)
-@pytest.mark.parametrize("noise", [0.02, 0.1])
+@pytest.mark.parametrize("noise", [pytest.param(0.02, marks=pytest.mark.slow), 0.1])
 @pytest.mark.parametrize(
     "delays", [[[45]], [[150]], [[45, 45], [44, 46]], [[45, 5], [12, 30]]],
     ids=["one", "long", "alike", "four"],

@@ -105,7 +105,7 @@ def both_bookkeepings(monkeypatch):
         yield name
 
 
-@pytest.mark.parametrize("seed", seeds(300, quick=60))
+@pytest.mark.parametrize("seed", seeds(300, quick=30))
 def test_the_optimum_is_that_of_brute_force_with_both_bookkeepings(seed, monkeypatch):
     case = random_case(seed)
     problem, rules, past, x, reference = case

@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 
 import mampc
+from seeds import examples
 
-CASES = [(seed, where, bank) for seed in range(12) for where in ("input", "output") for bank in (False, True)]
+CASES = [
+    (seed, where, bank)
+    for seed in range(examples(12, quick=5))
+    for where in ("input", "output")
+    for bank in (False, True)
+]
 
 
 def model_and_plant(seed):

@@ -5,6 +5,7 @@ import pytest
 
 import mampc
 from builders import random_model
+from seeds import examples
 
 METHODS = {
     "mpc": None,
@@ -217,7 +218,7 @@ def test_moves_and_words_are_the_same_whatever_the_units(method, rules):
     rounding from round to round, in the same units as well: penalty decomposition and ADMM.
     """
     rng = np.random.default_rng(0)
-    for seed in range(4):
+    for seed in range(examples(4, quick=1)):
         for limited in (True, False):
             usual = decisions_in(np.ones(2), np.ones(2), seed, method, RULED[rules], limited)
             for _ in range(2):
