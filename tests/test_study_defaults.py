@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import mampc
+from mampc.study.scenario_tables import ScenarioTable
 from mampc.study.schema import (
     ControllerTable,
     EstimatorTable,
@@ -13,7 +14,6 @@ from mampc.study.schema import (
     LimitsTable,
     ProblemTable,
     RulesTable,
-    ScenarioTable,
     SensorsTable,
 )
 

@@ -86,7 +86,7 @@ def front(
     from mampc.report.front_page import write_front_page
     from mampc.report.fronts import front_figure, front_tables, scenarios_of, write_rows
     from mampc.report.output import save_figure
-    from mampc.study.schema import file_word
+    from mampc.study.values import file_word
 
     plan, rows, folder = _swept(study, out, seeds, points, jobs, scheduler, yes, trust)
     write_rows(rows, folder / "sweep.csv")

@@ -116,7 +116,7 @@ def _row(name: str, text: str | None) -> Any:
 
 def _number(name: str, text: str) -> float:
     """A number, a share such as 5%, or a time with its unit."""
-    from mampc.study.schema import time_in_seconds
+    from mampc.study.values import time_in_seconds
 
     try:
         if text.strip().endswith("%"):

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mampc.study.running import Prepared, prepare, regulator_of, run_controller
-from mampc.study.schema import ControllerTable, ScenarioTable, Study
+from mampc.study.scenario_tables import ScenarioTable
+from mampc.study.schema import ControllerTable, Study
 
 SETTINGS = {
     "move_weight": "move weight lambda",

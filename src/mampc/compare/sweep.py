@@ -15,7 +15,8 @@ from mampc.compare.fronts import Point
 from mampc.compare.journal import Journal
 from mampc.compare.knobs import variants
 from mampc.study.running import Prepared, prepare, regulator_of, run_seeds
-from mampc.study.schema import ControllerTable, ScenarioTable, Study
+from mampc.study.scenario_tables import ScenarioTable
+from mampc.study.schema import ControllerTable, Study
 
 BASELINE = ControllerTable(name="MPC", method="mpc")
 SCHEDULER_SECONDS = 6  # that a cluster has to answer within

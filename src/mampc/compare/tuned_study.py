@@ -15,20 +15,22 @@ from mampc.compare.sweep import BASELINE
 from mampc.compare.tuning import Tuned
 from mampc.loop.loads import Load
 from mampc.study.running import Prepared, load_of, regulator_of
-from mampc.study.schema import (
+from mampc.study.scenario_tables import (
     LOADS,
     ChangeTable,
+    LoadTable,
+    MismatchTable,
+    ReferenceTable,
+    ScenarioTable,
+)
+from mampc.study.schema import (
     ControllerTable,
     EstimatorTable,
     LimitsTable,
-    LoadTable,
-    MismatchTable,
     ModelTable,
     PlantTable,
     ProblemTable,
-    ReferenceTable,
     RulesTable,
-    ScenarioTable,
     Study,
 )
 from mampc.systems.state_space import StateSpace

@@ -26,7 +26,7 @@ from mampc.loop.run import Run
 from mampc.report.labels import label_points
 from mampc.report.tables import baseline
 from mampc.study import StudyResult
-from mampc.study.schema import file_word
+from mampc.study.values import file_word
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

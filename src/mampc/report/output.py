@@ -17,7 +17,7 @@ from mampc.report.interactive import interactive_page
 from mampc.report.summary import summarise
 from mampc.study import Study, StudyResult, run_study
 from mampc.study.running import Prepared
-from mampc.study.schema import file_word
+from mampc.study.values import file_word
 
 SUMMARY = "summary.json"
 PAGE = "report.html"

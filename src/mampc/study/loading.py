@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from mampc.base.errors import MampcError, StudyError, shown
 from mampc.base.files import read_text
-from mampc.study.schema import Place, Study, Table
+from mampc.study.schema import Place, Study
+from mampc.study.values import Table
 
 STUDY_FILE_LIMIT = 2**18  # bytes
 LONGEST_LINE = 2000  # characters; the time that keys of many parts take grows with the square of their length

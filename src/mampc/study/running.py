@@ -29,15 +29,9 @@ from mampc.program.problem import Limits, TrackingProblem
 from mampc.rivals.registry import RIVALS, rival
 from mampc.study.cautions import cautions
 from mampc.study.plugins import make_plant
-from mampc.study.schema import (
-    BANK,
-    ControllerTable,
-    IdentificationTable,
-    LoadTable,
-    ScenarioTable,
-    Study,
-    Values,
-)
+from mampc.study.scenario_tables import LoadTable, ScenarioTable
+from mampc.study.schema import BANK, ControllerTable, IdentificationTable, Study
+from mampc.study.values import Values
 from mampc.study.wear import ratings_of
 from mampc.systems.mismatch import Mismatch
 from mampc.systems.signals import prbs, steps

@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
     Field,
     InstanceOf,
     model_validator,
 )
 
-from mampc.base.checks import LARGEST
 from mampc.base.errors import MampcError
-from mampc.loop import loads
-from mampc.loop.loads import Load
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.valves import Valves
 from mampc.methods.registry import METHODS, method_of
@@ -30,74 +22,35 @@ from mampc.plants import Level, QuadrupleTank, SolidOxideFuelCell, VanDeVusse, o
 from mampc.program.levels import OnOff
 from mampc.program.problem import LONGEST_HORIZON
 from mampc.rivals.registry import RIVALS, RULES, check_settings
+from mampc.study.scenario_tables import ReferenceTable, ScenarioTable
+from mampc.study.values import (
+    LONGEST_EXCITATION,
+    LONGEST_RUN,
+    Count,
+    Lag,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Rate,
+    Seed,
+    Table,
+    Time,
+    Values,
+    Weight,
+    Whole,
+    Widths,
+    Word,
+    file_word,
+)
 
 PLANTS: dict[str, Callable[..., Any]] = {
     "quadruple-tank": QuadrupleTank, "sofc": SolidOxideFuelCell, "van-de-vusse": VanDeVusse, "level": Level,
     "wood-berry": wood_berry, "ogunnaike-ray": ogunnaike_ray,
 }  # fmt: skip
 SAMPLED = ("wood-berry", "ogunnaike-ray")  # models, made for the study's sample time
+BANK = "bank"  # the method of a `ControllerBank`
 PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
-LONGEST_RUN = 1_000_000  # samples
-LONGEST_EXCITATION = 100_000  # samples
-LONGEST_NAME = 80  # bytes, in file names that hold two of them
-
-_SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-
-
-def time_in_seconds(value: Any) -> Any:
-    """A number of seconds, or text with a unit of time."""
-    if not isinstance(value, str):
-        return value
-    match = re.fullmatch(r"\s*([-+.\deE]+)\s*([A-Za-z%/]*)\s*", value)
-    if match is None or match[2] not in _SECONDS:
-        raise ValueError(f"a time such as 10.0 or '10 s' (units {', '.join(_SECONDS)})")
-    try:
-        return float(match[1]) * _SECONDS[match[2]]
-    except ValueError:
-        raise ValueError(f"a time such as 10.0 or '10 s' (units {', '.join(_SECONDS)})") from None
-
-
-def _rate(value: Any) -> Any:
-    """A number per second, or text with a unit of time, such as "0.5/min"."""
-    number, slash, unit = str(value).partition("/")
-    if not isinstance(value, str) or not slash:
-        return value
-    try:
-        return float(number) / _SECONDS[unit.strip()]
-    except (KeyError, ValueError):
-        raise ValueError(f"a rate such as 0.01 or '0.5/min' (units {', '.join(_SECONDS)})") from None
-
-
-def file_word(name: str) -> str:
-    """A name as it stands in file names."""
-    return re.sub(r"[\W_]+", "-", name.lower()).strip("-")
-
-
-def _short_as_file(name: str) -> str:
-    if len(file_word(name).encode()) > LONGEST_NAME:
-        raise ValueError(f"a name of at most {LONGEST_NAME} bytes, since files are named by it")
-    return name
-
-
-Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
-Time = Annotated[float, BeforeValidator(time_in_seconds), Field(gt=0, allow_inf_nan=False)]
-Lag = Annotated[float, BeforeValidator(time_in_seconds), Field(ge=0, allow_inf_nan=False)]
-Rate = Annotated[float, BeforeValidator(_rate), Field(gt=0, allow_inf_nan=False)]
-Values = Number | list[Number]
-Width = Annotated[float, Field(ge=0)]  # may be infinite
-Widths = Width | list[Width]
-Weight = Number | list[Number] | list[list[Number]]
-Word = Annotated[str, Field(min_length=1, max_length=80)]
-Name = Annotated[Word, AfterValidator(_short_as_file)]
-Whole = Annotated[int, Field(ge=0, le=LONGEST_RUN)]
-Count = Annotated[int, Field(ge=1, le=LONGEST_RUN)]
-Seed = Annotated[int, Field(ge=0, lt=2**64)]
-
-
-class Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class PlantTable(Table):
@@ -153,113 +106,6 @@ class ProblemTable(Table):
     zone_below: Widths = 0.0
     zone_above: Widths = 0.0
     output_rank: Count | list[Count] | None = None
-
-
-class ChangeTable(Table):
-    at: Whole
-    value: Values
-
-
-class ReferenceTable(Table):
-    relative: bool = True
-    preview: bool = False
-    initial: list[Number]
-    changes: list[ChangeTable] = []
-
-
-BANK = "bank"  # the method of a `ControllerBank`
-LOADS = {
-    "steps": loads.Steps, "random_steps": loads.RandomSteps, "random_walk": loads.RandomWalk,
-    "coloured": loads.Coloured, "sinusoid": loads.Sinusoid,
-}  # fmt: skip
-
-
-class LoadTable(Table):
-    """A load of `mampc.loads`, with the same settings; times in seconds or with a unit."""
-
-    kind: Literal["steps", "random_steps", "random_walk", "coloured", "sinusoid", "residuals"]
-    at: Literal["input", "output", "measured"] | None = None
-    size: Values | None = None
-    sizes: list[Values] | None = None
-    times: list[Lag] | None = None
-    every: Time | None = None
-    time_constant: Time | None = None
-    period: Time | None = None
-    phase: Number | Literal["random"] | None = None
-    file: Annotated[str, Field(min_length=1, max_length=1000)] | None = None
-
-    @model_validator(mode="after")
-    def _fits_its_kind(self) -> LoadTable:
-        if self.kind != "residuals":
-            self.made()
-        elif self.settings().keys() - {"at"} != {"file"}:
-            raise ValueError("a file for a load of kind 'residuals', and nothing else beside its kind and at")
-        return self
-
-    def settings(self) -> dict[str, Any]:
-        """What is said of it."""
-        given = {name: value for name, value in self if value is not None and name != "kind"}
-        if given.get("phase") == "random":
-            given["phase"] = None
-        return given
-
-    def made(self) -> Load:
-        """The load, of a kind that needs no file."""
-        kind, given = LOADS[self.kind], self.settings()
-        known = {field.name: field for field in fields(kind)}
-        wrong = given.keys() - known.keys()
-        missing = {name for name, field in known.items() if field.default is MISSING} - given.keys()
-        if wrong or missing:
-            what = f"no {', '.join(sorted(wrong))}" if wrong else f"{', '.join(sorted(missing))}"
-            raise ValueError(f"{what} for a load of kind {self.kind!r}")
-        try:
-            load: Load = kind(**given)
-        except MampcError as error:
-            raise ValueError(f"other settings of the load: {error}") from None
-        return load
-
-
-class ValvesTable(Table):
-    band: Values = 0.0
-    jump: Values = 0.0
-
-    @model_validator(mode="after")
-    def _consistent(self) -> ValvesTable:
-        try:
-            Valves(**self.model_dump())
-        except MampcError as error:
-            raise ValueError(f"other valves: {error}") from None
-        return self
-
-
-Share = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)]
-
-
-class MismatchTable(Table):
-    gain: Share = 0.0
-    lag: Share = 0.0
-    dead_time: Share = 0.0
-
-
-class SwitchTable(Table):
-    """From a sample on, another variant of banks of controllers decides."""
-
-    at: Whole
-    variant: Word
-
-
-class ScenarioTable(Table):
-    name: Name
-    noise: Values = 0.0
-    seed: Seed = 0
-    input_disturbance: Values | None = None
-    output_disturbance: Values | None = None
-    measured_disturbance: Values | None = None
-    disturbance_at: Whole = 0
-    loads: list[LoadTable] = []
-    valves: ValvesTable | None = None
-    mismatch: MismatchTable | None = None
-    switches: list[SwitchTable] = []
 
 
 class ActuatorsTable(Table):
