@@ -13,7 +13,7 @@ from mampc.methods.exact import ranking, tree
 from mampc.methods.exact.children import children_of
 from mampc.methods.exact.leaves import finished, with_one_more
 from mampc.methods.exact.nodes import renewed, root_of
-from mampc.methods.exact.relaxation import Multipliers, Relaxation
+from mampc.methods.exact.relaxation import ROUNDS, Multipliers, Relaxation, SampleRelaxation
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.exact.terms import Squares
 from mampc.moves.admissible import AdmissiblePatterns
@@ -323,3 +323,13 @@ def test_out_of_time_branching_keeps_a_valid_bound():
         objectives.append(decision.objective)
         bounds.append(decision.lower_bound)
     assert max(bounds) <= min(objectives) * (1 + 1e-9)
+
+
+def test_prices_of_moves_that_can_be_large_take_one_relaxed_program(monkeypatch):
+    problem = random_problem(3, n_c=8, limits=mampc.Limits(u_min=-1e4, u_max=1e4))
+    rounds, solve = [], SampleRelaxation._solve
+    monkeypatch.setattr(SampleRelaxation, "_solve", lambda *of: rounds.append(1) or solve(*of))
+    rng = np.random.default_rng(3)
+    decision = decide(problem, mampc.MoveRules(price=1.0), rng.standard_normal(3), 2 * rng.standard_normal(2))
+    assert decision.status is Status.OPTIMAL
+    assert 0 < len(rounds) <= ROUNDS

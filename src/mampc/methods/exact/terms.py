@@ -98,6 +98,21 @@ class Terms:
         s = np.where(self._domain.bounded & found.free, found.pulls, 0.0)
         self._put(*self.priced(found, s), s)
 
+    def drop_latest(self) -> None:
+        """Forget the latest of terms that are few."""
+        assert self.latest == len(self.ids) - 1
+        last = slice(self.latest)
+        self.ids.pop()
+        self.c, self.s, self.support, self.rest = (
+            self.c[:, last], self.s[:, last], self.support[:, last], self.rest[last],
+        )  # fmt: skip
+        self._later = [table[:, last] for table in self._later]
+        self.latest -= 1
+
+    def at_root(self, left: int) -> float:
+        """The bound before anything is decided, where so many moves are left."""
+        return float((self.rest + self.later(0, np.array([left]), None)[0]).max())
+
     def priced(self, found: Multipliers, s: Array) -> tuple[Array, float]:
         """c and rest with these multipliers of rows and the pulls s."""
         shift, excess = self._relaxation.priced(found.rows, s)

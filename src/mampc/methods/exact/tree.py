@@ -34,6 +34,7 @@ from mampc.program.sample import Indices, Sample
 CHUNK = 256  # nodes treated at once; half as many where each has three children
 TOGETHER = 64  # leaves tried at once
 SHARE = 0.5  # of the time limit that one relaxed program may take
+WORTH = 0.01  # of the gap at the root: prices of moves that can be large close nothing
 
 
 class PatternTree:
@@ -80,7 +81,7 @@ class PatternTree:
         if self._zoned:
             return search_zones(problem, solver, self._local)
         limited = bool(sample.margins.min(initial=np.inf) < 0)
-        if limited or self._admissible.priced:
+        if limited:
             self._relax_root(problem)
         if limited and self._close:
             return Branching(problem).run()
@@ -90,15 +91,24 @@ class PatternTree:
         found = problem.relaxation.of_bounds(best.multipliers)
         if found is not None and found.active:
             terms.add(found)
+        if not limited and self._admissible.priced:
+            self._relax_root(problem, WORTH)
         return _BatchSearch(problem).run()
 
-    def _relax_root(self, problem: SampleProblem) -> None:
-        """Bound everything with limits and prices as a relaxed program has them, and try its moves."""
-        domain = problem.domain
+    def _relax_root(self, problem: SampleProblem, worth: float = 0.0) -> None:
+        """Bound everything with limits and prices as a relaxed program has them, and try its moves.
+
+        They bound nothing where they close less than a share `worth` of the gap: each batch of nodes would take a
+        program more.
+        """
+        domain, terms = problem.domain, problem.terms
         found = problem.relaxation.solve_priced(domain.low, domain.high, domain.up, domain.down)
         if not found.solved or not found.active:
             return
-        problem.terms.add(found)
+        without = terms.at_root(problem.allowance.left)
+        terms.add(found)
+        if terms.at_root(problem.allowance.left) - without < worth * (problem.cutoff - without):
+            terms.drop_latest()
         pattern = problem.moving(found.moves)
         if self._admissible.allows(pattern, problem.allowance):
             problem.offer(pattern)
