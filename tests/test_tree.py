@@ -1,7 +1,7 @@
 """The search tree: its least squares, its bounds, and what it finds beyond the table, against independent ones."""
 
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import combinations, product, repeat
 
 import numpy as np
 import pytest
@@ -246,14 +246,16 @@ def test_on_off_inputs_are_as_good_as_the_best_of_all_sequences(seed):
     assert decision.objective == pytest.approx(best, rel=1e-9)
 
 
-def priced_case(seed, scale_u=1.0, scale_y=1.0):
+def priced_case(seed, scale_u=1.0, scale_y=1.0, max_moves=None):
     """A problem with move limits and a price, far from its reference; inputs and outputs in other units."""
     rng = np.random.default_rng(seed)
     model = random_model(seed, n=3, m=2, l=2)
-    counting = ["elementwise", "simultaneous"][seed % 2]
+    counting = ["elementwise", "simultaneous"][seed % 2 if max_moves is None else 0]
+    if max_moves is None and seed % 4 == 3:
+        max_moves = 3
     rules = mampc.MoveRules(
         price=0.1 + 0.3 * rng.random(), counting=counting, dwell=1 + seed % 3 // 2,
-        max_moves=3 if seed % 4 == 3 else None, max_moves_per_step=1 if seed % 5 == 4 else None,
+        max_moves=max_moves, max_moves_per_step=1 if seed % 5 == 4 else None,
     )  # fmt: skip
     scaled = mampc.StateSpace(
         model.A, model.B / scale_u, model.C * scale_y, None, 1.0, model.u_op * scale_u, model.y_op * scale_y
@@ -275,9 +277,11 @@ def decide(problem, rules, x, reference):
     return controller.step(controller.initial_state(), x, reference)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_move_limits_and_prices_branch_to_the_optimum_of_brute_force(seed, monkeypatch):
-    problem, rules, x, reference = priced_case(seed)
+@pytest.mark.parametrize(
+    ("seed", "max_moves"), [*zip(range(20), repeat(None)), *product(range(8), (1, 2, 3))]
+)
+def test_move_limits_and_prices_branch_to_the_optimum_of_brute_force(seed, max_moves, monkeypatch):
+    problem, rules, x, reference = priced_case(seed, max_moves=max_moves)
     runs = []
     of_program = tree.Branching
     monkeypatch.setattr(tree, "Branching", lambda at: runs.append(at) or of_program(at))

@@ -3,13 +3,13 @@
 At a node some moves are made, some left out, and the others undecided: free within what they can be, at the price
 per unit that is at most theirs (see `relaxation`). With the multipliers of its program the cost is a quadratic about
 the program's moves d, whose curvature is that of the free moves alone: with P = Z Z' the inverse of their normal
-matrix leaving out the move i adds at least
+matrix and s_i the pull at the move i, a move x there adds at least
 
-    d_i^2 / P_ii
+    (x - d_i)^2 / P_ii + p_i [x != 0] - s_i x - min(0, p_i - max s_i x)
 
-and making it what its price exceeds that in the program. Moves for which one of both is too much are decided at once;
-the search branches on the move whose leaving out adds most. Best bound first, so that a search cut short leaves
-the best bound there is.
+Left out, x is zero; made, the least of this within the move's limits counts. What both add, the node costs more;
+moves for which one of both is too much are decided at once; the search branches on the move whose leaving out adds
+most. Best bound first, so that a search cut short leaves the best bound there is.
 """
 
 from __future__ import annotations
@@ -176,23 +176,40 @@ class Branching:
         if of.simultaneous:
             bound, adds = self._of_samples(rest, support, undecided, paid)
         else:
-            adds = self._price - support
-            gains = np.minimum(adds, 0.0)
-            left = self._problem.allowance.left - int(made.sum())
-            open_ = gains[undecided]
-            if left < len(open_):
-                open_ = np.sort(open_)[:left]
-            bound = rest + float(adds[made].sum() + open_.sum())
-            out, adds = out - gains, adds - gains
-            moving = out[undecided & (d != 0)]
-            if left < len(moving):  # so many of them have to be left out
-                bound += float(np.sort(moving)[len(moving) - left - 1])
+            bound, left_out, adds = self._of_moves(rest, s, d, variance, undecided, made)
+            out += left_out
+        raised = float(np.minimum(out, adds).max(where=undecided, initial=0.0))
+        left, moving = self._problem.allowance.left - int(made.sum()), undecided & (d != 0)
+        if not of.simultaneous and (more := int(moving.sum()) - left) > 0:
+            raised = max(raised, float(np.sort(out[moving])[more - 1]))  # so many have to be left out
         # The moves of the program, and those that are at least half of what they may be.
         cost = bound - of.charge(self._problem.pattern(made)) - float(np.maximum(d * up, -d * down).sum())
         self._try(np.where(within, d, 0.0), cost)
         large = (np.maximum(d * domain.up, -d * domain.down) >= 0.5 * self._price) | made
         self._try(np.where(large & within, d, 0.0), cost)
-        return Solved(bound, d, out, adds, undecided)
+        return Solved(
+            bound + raised, d, np.maximum(out - raised, 0.0), np.maximum(adds - raised, 0.0), undecided
+        )
+
+    def _of_moves(
+        self, rest: float, s: Array, d: Array, variance: Array, undecided: BoolArray, made: BoolArray
+    ) -> tuple[float, Array, Array]:
+        """Bound, and what leaving out moves adds beside the cost without prices, and what making them adds.
+
+        A move x costs (x - d)^2 / variance - s x more at least, and its price.
+        """
+        domain = self._problem.domain
+        support = domain.support(s)
+        gains = np.minimum(self._price - support, 0.0)
+        left = self._problem.allowance.left - int(made.sum())
+        open_ = np.sort(gains[undecided])
+        bound = rest + float((self._price - support)[made].sum() + open_[:left].sum())
+        # Without a move that gains the next one may, where the budget leaves one out.
+        next_ = open_[left] if left < len(open_) else 0.0
+        x = np.minimum(np.maximum(d + 0.5 * s * variance, domain.low), domain.high)
+        away = x - d
+        adds = self._price - s * x + away * away / np.where(variance > 0, variance, np.inf)
+        return bound, np.maximum(next_ - gains, 0.0), np.maximum(adds - gains, 0.0)
 
     def _of_samples(
         self, rest: float, support: Array, undecided: BoolArray, paid: BoolArray
