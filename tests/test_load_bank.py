@@ -205,6 +205,42 @@ def said(load, samples=300, seed=0):
     return [decision.load for decision in run.decisions], run
 
 
+@pytest.mark.parametrize("units", [(1e8, 1e-8), (1e-6, 1e6), (1e-3, 1e3)])
+def test_states_in_any_units_have_the_same_gains(units):
+    """Dead times keep past inputs as states, which so have the units of these."""
+    gain, lag, delay = (
+        np.array([[-0.5, 1.3], [-0.7, 0.9]]),
+        [[9.0, 4.0], [2.0, 15.0]],
+        [[3.3, 1.0], [4.0, 2.5]],
+    )
+    loads = []
+    for u, y in ((1.0, 1.0), units):
+        model = mampc.StateSpace.from_first_order(
+            gain=gain * y / u, time_constant=lag, dead_time=delay, dt=1.0
+        )
+        bank, nothing = LoadBank(model, noise=0.05 * y), np.zeros(0)
+        estimate = bank.initial(np.zeros(2))
+        for _ in range(3):
+            estimate = bank.update(
+                estimate, np.full(2, u), np.array([0.3, -0.2]) * y, nothing, nothing
+            ).estimate
+        loads.append(bank.loads_of(estimate))
+    np.testing.assert_allclose(loads[1], loads[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plants_with_more_inputs_than_outputs_and_long_delays_have_a_bank(seed):
+    """Many loads, some of which no output can tell apart."""
+    rng = np.random.default_rng(seed)
+    size = (4, 5)
+    inputs, outputs = 10 ** rng.uniform(-8, 8, 5), 10 ** rng.uniform(-8, 8, 4)
+    model = mampc.StateSpace.from_first_order(
+        gain=rng.standard_normal(size) * outputs[:, None] / inputs, time_constant=10 ** rng.uniform(-1, 2, size),
+        dead_time=rng.uniform(0, 5, size), dt=1.0,
+    )  # fmt: skip
+    assert LoadBank(model, noise=0.05 * outputs).model is model
+
+
 def test_what_loads_do_is_said_in_words():
     unit = LoadBank(identified_tank(), noise=0.1).loads.at_inputs[:, :2].diagonal()
     k, rng = np.arange(300)[:, None], np.random.default_rng(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from mampc.base.errors import MampcError
 
 _ROUNDS = 60  # each doubles the number of samples seen
 _SETTLED = 1e-10  # what one more doubling may still add, as a share of what is there
+_ROUNDED = 1e-8  # the same where rounding lets it add more with every further doubling
+_SCALING = 5  # doublings that tell how far states go
 
 
 def predicted_covariance(A: Array, C: Array, Q: Array, R: Array) -> Array:
@@ -34,15 +37,32 @@ def seen_covariance(A: Array, C: Array, Q: Array, R: Array) -> Array:
     Raises:
         MampcError: it does not settle: a mode that grows is not seen, or never disturbed.
     """
+    last, added = Q, np.inf
     for P, more in _doubled(A, C, Q, R):
         size = np.sqrt(np.outer(np.diag(C @ P @ C.T) + np.diag(R), np.diag(P)))
-        if (np.abs(C @ more) <= _SETTLED * size).all():
+        last_added, added = added, float((np.abs(C @ more) / np.where(size > 0, size, 1.0)).max(initial=0.0))
+        if added <= _SETTLED:
             return P
+        if last_added <= _ROUNDED and not added < last_added:
+            return last
+        last = P
     raise MampcError("expected a model whose modes are all seen and disturbed, the Riccati equation failed")
 
 
 def _doubled(A: Array, C: Array, Q: Array, R: Array) -> Iterator[tuple[Array, Array]]:
-    """P after 2, 4, 8, ... samples, and by how much it grew, until numbers overflow.
+    """P after 2, 4, 8, ... samples, and by how much it grew, until numbers overflow; in any units of the states."""
+    spread = np.ones(len(A))
+    for P, _ in islice(_doubled_as_told(A, C, Q, R), _SCALING):
+        spread = np.sqrt(np.diag(P))
+    # Powers of two change no digit.
+    unit = 2.0 ** np.round(np.log2(np.where(spread > 0, spread, 1.0)))
+    units = np.outer(unit, unit)
+    for P, more in _doubled_as_told(A * unit / unit[:, None], C * unit, Q / units, R):
+        yield P * units, more * units
+
+
+def _doubled_as_told(A: Array, C: Array, Q: Array, R: Array) -> Iterator[tuple[Array, Array]]:
+    """The same with the numbers as they are.
 
     Source: Chu, Fan, Lin and Wang, Int. J. Control 77 (2004): structure-preserving doubling, which converges
     quadratically.
