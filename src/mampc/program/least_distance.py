@@ -24,7 +24,6 @@ from mampc.program.refinement import refined
 SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
 UNCERTAIN = 1e-10  # of the excess: what a solver's slack may be worth before the solution is refined
 DOUBTFUL = 1e4  # condition of R from which on the slack that a solver leaves is looked at
-MOST_ROUNDS = 100  # of a refinement
 
 
 class Nearest(NamedTuple):
@@ -166,7 +165,7 @@ class LeastDistance:
         A[:v, :v], A[v:, :v], A[v:, v:] = np.eye(v), self._violations, self._rows
         reached = self._R.dot(optimum)
         c = np.concatenate([-0.5 * self._cost.linear / root, reached])
-        better = refined(F, c, A, lower, upper, multipliers, MOST_ROUNDS)
+        better = refined(F, c, A, lower, upper, multipliers)
         if better is None:
             return Nearest(None, np.inf, None, QPStatus.FAILED, iterations)
         moves = better.z[v:]

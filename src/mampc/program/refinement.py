@@ -20,6 +20,7 @@ from mampc.base.checks import Array
 BROKEN = 1e-11  # of the sizes in a row: a bound missed by more is not kept
 WRONG = 1e-11  # of the largest multiplier: one of the wrong sign by more is wrong
 DEPENDENT = 1e-12  # of a row's length: what others leave of it, when it says nothing new
+ROUNDS, ROUNDS_PER_VARIABLE = 100, 4  # until it is given up; each takes up one bound, or leaves one out
 
 
 class Refined(NamedTuple):
@@ -29,14 +30,14 @@ class Refined(NamedTuple):
     multipliers: Array
 
 
-def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array, most: int) -> Refined | None:
-    """The optimum, from the active bounds that multipliers `pull` (rows,) tell; None if not found in `most` rounds."""
+def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array) -> Refined | None:
+    """The optimum, from the active bounds that multipliers `pull` (rows,) tell; None if not found."""
     length = np.sqrt(np.square(A).sum(axis=1))
     length[length == 0] = 1.0
     A, low, high = A / length[:, None], low / length, high / length
     signs = {int(i): float(np.sign(pull[i])) for i in np.flatnonzero(pull)}
     factor: Array = np.asarray(np.linalg.qr(F, mode="r"))
-    for _ in range(most):
+    for _ in range(ROUNDS + ROUNDS_PER_VARIABLE * len(F.T)):
         solved = _at(F, c, A, low, high, signs)
         if solved is None:
             return None
