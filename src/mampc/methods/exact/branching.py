@@ -228,12 +228,24 @@ class Branching:
     def _try(self, moves: Array, cost: float) -> None:
         """Offer the best plan with the moves that are not zero, if they keep the rules.
 
-        `cost` is about the least that they cost without prices: what cannot be best at that is left.
+        `cost` is about the least that they cost without prices: what cannot be best at that is left, and what the
+        relaxed program, which is prepared, shows not to be best.
         """
         problem, pattern = self._problem, self._problem.moving(moves)
-        key = pattern.tobytes()
-        if key in self._tried or cost + self._of.charge(pattern) >= problem.best.objective:
+        key, charge = pattern.tobytes(), self._of.charge(pattern)
+        if key in self._tried or cost + charge >= problem.best.objective:
             return
         self._tried.add(key)
-        if self._of.allows(pattern, problem.allowance):
+        if not self._of.allows(pattern, problem.allowance):
+            return
+        made, domain = pattern[problem.order], problem.domain
+        low, high = np.where(made, domain.low, 0.0), np.where(made, domain.high, 0.0)
+        found = problem.relaxation.solve(low, high)
+        if found.solved:
+            s = np.where(domain.bounded | ~made, found.pulls, 0.0)
+            _, rest = problem.terms.priced(found, s)
+            cost = rest - float(np.maximum(s * low, s * high).sum())
+            if cost + charge >= problem.cutoff:
+                return
+        if not found.infeasible:
             problem.offer(pattern)

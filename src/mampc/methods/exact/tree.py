@@ -80,38 +80,41 @@ class PatternTree:
             return np.inf
         if self._zoned:
             return search_zones(problem, solver, self._local)
-        limited = bool(sample.margins.min(initial=np.inf) < 0)
+        limited, close = bool(sample.margins.min(initial=np.inf) < 0), self._close
         if limited:
             self._relax_root(problem)
-        if limited and self._close:
-            return Branching(problem).run()
-        terms, f = problem.terms, np.zeros(self._admissible.n_moves)
-        f[problem.order] = -2.0 * (terms.c[:, -1] @ self._squares.L[:, :-1])
-        self._local.offer(solver, sample, f, allowance, best, deadline)
-        found = problem.relaxation.of_bounds(best.multipliers)
-        if found is not None and found.active:
-            terms.add(found)
-        if not limited and self._admissible.priced:
-            self._relax_root(problem, WORTH)
-        return _BatchSearch(problem).run()
+        if not (limited and close):
+            terms, f = problem.terms, np.zeros(self._admissible.n_moves)
+            f[problem.order] = -2.0 * (terms.c[:, -1] @ self._squares.L[:, :-1])
+            self._local.offer(solver, sample, f, allowance, best, deadline)
+            found = problem.relaxation.of_bounds(best.multipliers)
+            if found is not None and found.active:
+                terms.add(found)
+            if not limited and self._admissible.priced:
+                close &= self._relax_root(problem, WORTH)
+        if problem.terms.at_root(allowance.left) >= problem.cutoff:
+            return np.inf
+        return Branching(problem).run() if close else _BatchSearch(problem).run()
 
-    def _relax_root(self, problem: SampleProblem, worth: float = 0.0) -> None:
+    def _relax_root(self, problem: SampleProblem, worth: float = 0.0) -> bool:
         """Bound everything with limits and prices as a relaxed program has them, and try its moves.
 
         They bound nothing where they close less than a share `worth` of the gap: each batch of nodes would take a
-        program more.
+        program more. Says whether they do.
         """
         domain, terms = problem.domain, problem.terms
         found = problem.relaxation.solve_priced(domain.low, domain.high, domain.up, domain.down)
         if not found.solved or not found.active:
-            return
+            return False
         without = terms.at_root(problem.allowance.left)
         terms.add(found)
-        if terms.at_root(problem.allowance.left) - without < worth * (problem.cutoff - without):
+        close = terms.at_root(problem.allowance.left) - without >= worth * (problem.cutoff - without)
+        if not close:
             terms.drop_latest()
         pattern = problem.moving(found.moves)
         if self._admissible.allows(pattern, problem.allowance):
             problem.offer(pattern)
+        return close
 
 
 class _BatchSearch:
