@@ -316,8 +316,8 @@ def test_what_may_be_a_number_is_refused_with_its_row(tmp_path, cell):
 
 
 def test_a_column_without_numbers_is_refused(tmp_path):
-    with pytest.raises(MampcError, match="expected numbers in column 'u', received only 'Open', 'Shut'"):
-        read(tmp_path, text(rows(u=["Open", "Shut"] * 6)))
+    with pytest.raises(MampcError, match="expected numbers in column 'u', received only 'High', 'Low'"):
+        read(tmp_path, text(rows(u=["High", "Low"] * 6)))
 
 
 @pytest.mark.parametrize(
@@ -532,8 +532,10 @@ def test_gaps_and_marks_in_frames():
     export = read_export(data, inputs="u", outputs="y")
     assert [len(record) for record in export.records] == [4, 3, 3]
     data["u"] = data["u"] > 5
+    export = read_export(data, inputs="u", outputs="y")
+    assert np.array_equal(export.records[0].u[:, 0], U[:4] > 5)
     with pytest.raises(MampcError, match="expected numbers in column 'u'"):
-        read_export(data, inputs="u", outputs="y")
+        read_export(data, inputs="y", outputs="u")
 
 
 @pytest.mark.parametrize("wrong", [None, 5, [[1, 2]], pd.Series([1.0, 2.0]), pd.DataFrame()])

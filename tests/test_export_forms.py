@@ -178,11 +178,89 @@ def test_inputs_that_stand_only_where_they_change_are_refused_with_what_closes_t
     np.testing.assert_array_equal(record.u[:, 0], U[: len(record)])
 
 
-@pytest.mark.parametrize("words", [("ON", "OFF"), ("TRUE", "FALSE"), ("AUTO", "MAN")])
-def test_words_are_no_numbers_and_the_refusal_says_what_to_do(tmp_path, words):
+@pytest.mark.parametrize(
+    ("off", "on"), [("OFF", "ON"), ("Closed", "OPEN"), ("false", "true"), ("Aus", "Ein"), ("Zu", "Auf")]
+)
+def test_two_states_in_words_are_0_and_1_for_inputs(tmp_path, off, on):
+    content = rows(lambda k, u, y: f"{stamp(k)},{on if u > 50 else off},{y}", ["time,u,y"])
+    export = read(tmp_path, content)
+    np.testing.assert_array_equal(export.records[0].u[:, 0], U > 50)
+    assert any(f"{off.upper()} as 0 and {on.upper()} as 1" in note for note in export.changes)
+    with pytest.raises(MampcError, match="only inputs may be words"):
+        read(tmp_path, content, inputs="y", outputs="u")
+    assert [column.name for column in inspect_export(tmp_path / "export.csv").columns] == ["u", "y"]
+
+
+@pytest.mark.parametrize("words", [("AUTO", "MAN"), ("OPEN", "MOVING"), ("ON", "ON")])
+def test_other_words_are_no_numbers_and_the_refusal_says_what_to_do(tmp_path, words):
     content = rows(lambda k, u, y: f"{stamp(k)},{words[int(u > 50)]},{y}", ["time,u,y"])
-    with pytest.raises(MampcError, match="save words that mean numbers"):
+    with pytest.raises(MampcError, match="save others as numbers"):
         read(tmp_path, content)
+
+
+def test_a_third_state_is_a_missing_value(tmp_path):
+    content = rows(
+        lambda k, u, y: f"{stamp(k)},{'MOVING' if k == 7 else 'OPEN' if u > 50 else 'CLOSED'},{y}",
+        ["time,u,y"],
+    )
+    assert [len(record) for record in read(tmp_path, content).records] == [7, 12]
+
+
+@pytest.mark.parametrize("form", ["{:.1f}%", "{:.1f} %", "{:.1f} m3/h", "{:.1f}°C"])
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_a_unit_behind_every_number_is_its_unit(tmp_path, form, decimal):
+    content = rows(
+        lambda k, u, y: f"{stamp(k)};{form.format(u)};{y:.3f} bar".replace(".", decimal), ["time;u;y"]
+    )
+    export = read(tmp_path, content)
+    assert_whole(export)
+    assert export.records[0].names.units == (("u", form[6:].strip()), ("y", "bar"))
+    content = content.replace("45", "45.0", 1) if decimal == "." else content
+    with pytest.raises(MampcError, match="expected a number"):  # two units in one column
+        read(tmp_path, content.replace(" bar", " mbar", 3))
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%a %b %d %H:%M:%S CEST %Y", "%a %b %d %H:%M:%S %Y", "%a, %d %b %Y %H:%M:%S +0200", "%A, %B %d, %Y %I:%M:%S %p",
+        "%d. Mai %Y %H:%M:%S", "%d-MAI-%y %H:%M:%S", "%d mai %Y %H:%M:%S", "%Y-%m-%d %H:%M:%S CEST",
+        "%d.%m.%Y %H:%M:%S MESZ", "%d/%b/%Y:%H:%M:%S +0200", "Fr %d.%m.%Y %H:%M:%S", "%b %d, %Y %I:%M:%S %p",
+    ],
+)  # fmt: skip
+def test_dates_in_words(tmp_path, form):
+    assert_whole(read(tmp_path, rows(lambda k, u, y: f"{stamp(k, form)};{u};{y}", ["time;u;y"])))
+
+
+def test_the_name_of_a_zone_tells_when_clocks_are_put_back(tmp_path):
+    def local(k):
+        moment = pd.Timestamp("2024-10-27 00:59:00", tz="UTC") + pd.Timedelta(seconds=10 * k)
+        return moment.tz_convert("Europe/Berlin").strftime("%a %b %d %H:%M:%S %Z %Y")
+
+    export = read(tmp_path, rows(lambda k, u, y: f"{local(k)},{u},{y}", ["time,u,y"]))
+    assert_whole(export)
+    assert not export.changes
+
+
+@pytest.mark.parametrize(("power", "words"), [(3, "milliseconds"), (6, "microseconds"), (9, "nanoseconds")])
+def test_times_since_1970_in_small_units(tmp_path, power, words):
+    content = rows(lambda k, u, y: f"{(1_700_000_000 + 10 * k) * 10**power},{u},{y}", ["timestamp,u,y"])
+    export = read(tmp_path, content)
+    assert_whole(export)
+    assert any(words in note for note in export.notes)
+
+
+@pytest.mark.parametrize(
+    "word", ["Good, Annotated", "Good [Non-Specific]", "good - local override", "192 Good"]
+)
+def test_what_is_said_behind_good_keeps_it_good(tmp_path, word):
+    content = rows(
+        lambda k, u, y: (
+            f'{stamp(k)},{u},{y},"{"Good, Questionable" if k == 9 else word if k % 3 else "Good"}"'
+        ),
+        ["time,u,y,y Status"],
+    )
+    assert [len(record) for record in read(tmp_path, content).records] == [9, 10]
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import shown
+from mampc.identification.export.date_words import plain_date
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import POINT, clean, is_number, numeric_share
@@ -187,7 +188,7 @@ def _sampled(sheet: Sheet, at: int) -> list[str]:
 
 
 def _share(sheet: Sheet, at: int, test: Callable[[str], Any]) -> float:
-    cells = [clean(cell) for cell in _sampled(sheet, at) if cell]
+    cells = [plain_date(clean(cell)) for cell in _sampled(sheet, at) if cell]
     return sum(bool(test(cell)) for cell in cells) / len(cells) if cells else 0.0
 
 
@@ -224,9 +225,10 @@ def _from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) -
     known = values[~np.isnan(values)]
     least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     usual = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
-    if LATEST * 1e2 < most < LATEST * 1e3:
-        findings.note(f"times in column {name!r} are taken as milliseconds since 1970")
-        return values / 1e3
+    for size, unit_name in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
+        if LATEST * 0.1 * size < most < LATEST * size:
+            findings.note(f"times in column {name!r} are taken as {unit_name} since 1970")
+            return (values - least) / size + least / size
     if most > LATEST:
         findings.doubt(
             f"times in column {name!r} are numbers as large as {most:.15g}; pass their unit (--time-unit) or their "

@@ -15,7 +15,7 @@ from mampc.identification.export.clock import Clock, read_clock
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.grid import make_grid, pieces
 from mampc.identification.export.header import find_column
-from mampc.identification.export.numbers import Column, numeric_share, read_numbers
+from mampc.identification.export.numbers import Column, read_numbers, says_numbers
 from mampc.identification.export.quality import drop_bad_quality, is_quality
 from mampc.identification.export.reading import ReadingOptions, listed, readings
 from mampc.identification.export.sheet import Sheet
@@ -116,7 +116,8 @@ def inspect_export(
     ]
     positions = dict(zip(wanted, taken, strict=True)) or _numeric(sheet, free)
     others = tuple(sheet.header[at] for at in free if at not in positions.values()) if not wanted else ()
-    columns, values = read_numbers(sheet, positions, reading, findings)
+    switches = [name for name in positions if name not in listed(outputs)]
+    columns, values = read_numbers(sheet, positions, reading, findings, switches)
     drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
     for column in columns:
         if column.marks:
@@ -135,7 +136,7 @@ def inspect_export(
         order = np.argsort(clock.seconds, kind="stable")[: np.count_nonzero(~np.isnan(clock.seconds))]
         seconds = clock.seconds[order]
     summaries = tuple(
-        _summary(column, sheet.units.get(positions[column.name], ""), order) for column in columns
+        _summary(column, sheet.units.get(positions[column.name], column.unit), order) for column in columns
     )
     return Inspection(
         findings.origin, summaries, others, clock.name if clock else "", seconds, grid.dt if grid else None,
@@ -148,7 +149,7 @@ def _numeric(sheet: Sheet, free: Sequence[int]) -> dict[str, int]:
     """Columns with numbers in more than half of the first rows' filled cells; of two with one name, the first."""
     found: dict[str, int] = {}
     for at in free:
-        if numeric_share(row[at] for row in sheet.sample) > 0.5:
+        if says_numbers([row[at] for row in sheet.sample]):
             found.setdefault(sheet.header[at], at)
     return found
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from array import array
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy.typing as npt
 
 from mampc.base.checks import LARGEST, Array, as_number
 from mampc.base.errors import MampcError, shown
+from mampc.identification.export.cell_words import STATES, states, without_unit
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.sheet import Cells, Sheet
 
@@ -74,11 +76,13 @@ class Column:
         name: as it stands in the header.
         values: shape (N,).
         marks: what stood in the place of numbers: how often, and the first row.
+        unit: behind each of its numbers; empty where there is none.
     """
 
     name: str
     values: Array
     marks: dict[str, list[int]] = field(default_factory=dict)
+    unit: str = ""
 
     def mark(self, what: str, row: int) -> None:
         """Count one cell without a number."""
@@ -95,10 +99,15 @@ class Column:
 
 
 def read_numbers(
-    sheet: Sheet, columns: Mapping[str, int], reading: Reading, findings: Findings
+    sheet: Sheet,
+    columns: Mapping[str, int],
+    reading: Reading,
+    findings: Findings,
+    switches: Collection[str] = (),
 ) -> tuple[list[Column], Array]:
     """The columns, by name and position, as numbers; cells that may or may not be numbers become doubts.
 
+    Columns that may be `switches` are 0 and 1 where they hold nothing but two states in words, such as OFF and ON.
     Their values are the columns of one array, shape (N, columns), which is returned beside them.
     """
     doubts = len(findings.doubts)
@@ -115,7 +124,7 @@ def read_numbers(
         for reader, cells in zip(readers, part, strict=True):
             reader.read(start, cells, rows)
         start += len(rows)
-    return [reader.finish(sheet.numbers, findings) for reader in readers], values
+    return [reader.finish(sheet.numbers, findings, switches) for reader in readers], values
 
 
 def clean(cell: str) -> str:
@@ -133,6 +142,8 @@ class _Reader:
         self.unclear: dict[str, list[int]] = {}
         self.either: list[tuple[int, str]] = []  # positions and cells such as 1,234
         self.grouped = grouped  # whether thousands are known to stand in groups
+        self.states: dict[str, array[int]] = {}  # positions of words such as ON
+        self.units: dict[str, list[tuple[int, str, str]]] = {}  # positions, numbers and cells such as 12 %
 
     def read(self, start: int, cells: Cells, rows: npt.NDArray[np.int64]) -> None:
         values = self.column.values[start : start + len(cells)]
@@ -157,8 +168,11 @@ class _Reader:
                     values[i] = self._number(start + i, clean(cell), int(rows[i]))
         self._drop_beyond_reason(values, rows)
 
-    def finish(self, rows: npt.NDArray[np.int64], findings: Findings) -> Column:
+    def finish(self, rows: npt.NDArray[np.int64], findings: Findings, switches: Collection[str]) -> Column:
         column = self.column
+        self._take_units(rows, findings)
+        if column.name in switches:
+            self._take_states(findings)
         if self.either and self.grouped:
             for at, cell in self.either:
                 column.values[at] = float(cell.replace(",", ""))
@@ -183,7 +197,7 @@ class _Reader:
             hint = (
                 ""
                 if set(column.marks) <= {"nothing"}
-                else "; save words that mean numbers, such as ON, as numbers"
+                else "; only inputs may be words, and of these only two such as ON and OFF; save others as numbers"
             )
             findings.doubt(f"expected numbers in column {column.name!r}, received only {found}{hint}")
         return column
@@ -205,9 +219,41 @@ class _Reader:
             self.column.mark("nothing", row)
         elif not DIGIT.search(cell) or MARK.search(cell):
             self.column.mark(shown(cell), row)
+            if cell.casefold() in STATES:
+                self.states.setdefault(cell.casefold(), array("q")).append(at)
         else:
-            self.unclear.setdefault(cell, []).append(row)
+            number, unit = without_unit(word)
+            if unit and (POINT.fullmatch(number) or GROUPED_FOR_SURE.fullmatch(number)):
+                self.units.setdefault(unit, []).append((at, number.replace(",", ""), cell))
+            else:
+                self.unclear.setdefault(cell, []).append(row)
         return np.nan
+
+    def _take_units(self, rows: npt.NDArray[np.int64], findings: Findings) -> None:
+        """Numbers with a unit behind them count where each number of the column has it, and the same one."""
+        column = self.column
+        if len(self.units) == 1 and not (self.unclear or self.either) and np.isnan(column.values).all():
+            [(unit, cells)] = self.units.items()
+            for at, number, _ in cells:
+                column.values[at] = float(number)
+            column.unit = unit.translate(SWAPPED) if self.decimal == "," else unit
+            findings.note(f"{column.name}: {shown(column.unit)} stands behind each number, read as its unit")
+            return
+        for cells in self.units.values():
+            for at, _, cell in cells:
+                self.unclear.setdefault(cell, []).append(int(rows[at]))
+
+    def _take_states(self, findings: Findings) -> None:
+        """Two states in words as 0 and 1, where there is no number."""
+        column, pair = self.column, states(frozenset(self.states))
+        if pair is None or not np.isnan(column.values).all() or self.unclear or self.either:
+            return
+        for word, at in self.states.items():
+            column.values[np.frombuffer(at, dtype=np.int64)] = float(word == pair[1])
+        for what in [what for what in column.marks if what.strip("'\"").casefold() in pair]:
+            del column.marks[what]
+        off, on = (word.upper() for word in pair)
+        findings.change(f"{column.name}: words read as numbers, {off} as 0 and {on} as 1")
 
     def _drop_beyond_reason(self, values: Array, rows: npt.NDArray[np.int64]) -> None:
         for i in np.flatnonzero(np.abs(values) >= LARGEST):
@@ -256,7 +302,7 @@ def _decimal_mark(sheet: Sheet, columns: Sequence[int], findings: Findings) -> s
             for cell in cells if isinstance(cells, list) else ():
                 if "," not in cell and "." not in cell:
                     continue
-                word = SPACE.sub("", clean(cell))
+                word = SPACE.sub("", without_unit(clean(cell))[0])
                 if EITHER.fullmatch(word):
                     either = either or word
                     continue
@@ -291,3 +337,14 @@ def numeric_share(cells: Iterable[str]) -> float:
     filled = [SPACE.sub("", clean(cell)) for cell in cells if cell]
     numbers = sum(map(is_number, filled))
     return numbers / len(filled) if filled else 0.0
+
+
+def says_numbers(cells: Sequence[str]) -> bool:
+    """Whether most cells that hold anything are numbers, with or without one unit, or two states in words."""
+    if numeric_share(cells) > 0.5:
+        return True
+    filled = [clean(cell) for cell in cells if cell]
+    if sum(cell.casefold() in STATES for cell in filled) > len(filled) / 2:
+        return True
+    bare = [number for number, unit in map(without_unit, filled) if unit]
+    return len(bare) > len(filled) / 2 and numeric_share(bare) > 0.5

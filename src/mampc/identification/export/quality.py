@@ -18,6 +18,10 @@ from mampc.identification.export.sheet import Cells, Sheet
 WORDS = ("quality", "qual", "opcquality", "status", "validity", "qualität", "qualitaet", "qualité", "calidad")
 BEHIND_A_NAME = (*WORDS, "q", "qc", "st", "state", "flag", "good", "valid")
 GOOD = frozenset({"good", "g", "ok", "valid", "normal", "raw", "gut", "bon", "true", "yes"})
+# Behind "good", such as "Good, Annotated" or "Good [Non-Specific]", what does not take it back.
+STILL_GOOD = re.compile(
+    r"(\d+ )?(good|gut|bon|ok)\b(?!.*\b(not|bad|questionable|uncertain|suspect|stale|substituted)\b).*"
+)
 OPC_GOOD = range(192, 256)  # the quality byte of OPC DA: its two highest bits are set
 
 
@@ -96,7 +100,7 @@ def _good(words: Sequence[str], named: Sequence[str]) -> BoolArray | None:
     """Which words mean a good value; None if that cannot be told."""
     kinds = set(words)
     numbers = {word: int(float(word)) for word in kinds if re.fullmatch(r"\d+(\.0+)?", word)}
-    good = {word for word in kinds if word in GOOD or word in named}
+    good = {word for word in kinds if word in GOOD or word in named or STILL_GOOD.fullmatch(word)}
     if not named:
         good |= {word for word, number in numbers.items() if number in OPC_GOOD}
     if not good and len(kinds) == 1 and (kinds == {""} or set(numbers.values()) == {0}):

@@ -145,7 +145,8 @@ def _read_table(
     units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
     quality = tuple(quality_columns(sheet.header, positions))
     clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
-    columns, values = read_numbers(sheet, positions, reading, findings)
+    columns, values = read_numbers(sheet, positions, reading, findings, (*names.inputs, *names.disturbances))
+    units = {column.name: column.unit for column in columns if column.unit} | units
     drop_bad_quality(sheet, columns, positions, good, findings)
     for column in columns:
         if column.marks:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from mampc.base.errors import MampcError, shown
 from mampc.base.files import read_bounded
+from mampc.identification.export.cell_words import without_unit
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import (
     Row,
@@ -223,7 +224,7 @@ def _measured(
             broken.append(number)
         if len(sample) < 50:
             cells = _stripped(row)
-            if not numbers and not any(is_number_like(cells[at]) for at in positions):
+            if not numbers and not any(is_number_like(without_unit(cells[at])[0]) for at in positions):
                 descriptions.append((number, cells))
                 continue
             sample.append(cells[:width])

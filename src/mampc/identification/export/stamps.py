@@ -13,6 +13,7 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
+from mampc.identification.export.date_words import plain_date
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.sheet import Cells, Sheet
 
@@ -126,6 +127,8 @@ def from_stamps(
 ) -> tuple[Array, Any]:
     """Seconds after the first stamp, and that stamp."""
     words = [UTC.sub("+00:00", " ".join(cell.split())) for cell in cells]
+    if how.time_format is None:
+        words = [plain_date(word) for word in words]
     offsets = [cell for cell in words if _has_offset(cell)]
     if offsets and len(offsets) < 0.9 * sum(map(bool, words)):
         findings.doubt(

@@ -1,0 +1,54 @@
+"""Dates in words: days of the week, months in several languages and names of zones, as `strptime` reads them."""
+
+from __future__ import annotations
+
+import re
+
+# First letters that tell a month in English, German, French, Spanish, Italian, Dutch, Portuguese.
+MONTHS = (
+    ("jan", "ene", "gen", "jän"), ("feb", "fév", "fev"), ("mar", "mär", "mrz", "maa", "mrt"), ("apr", "avr", "abr"),
+    ("may", "mai", "mag", "mei"), ("jun", "juin", "giu"), ("jul", "juil", "lug"), ("aug", "aoû", "aou", "ago"),
+    ("sep", "set"), ("oct", "okt", "ott", "out"), ("nov",), ("dec", "dez", "déc", "dic"),
+)  # fmt: skip
+ENGLISH = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+BY_LETTERS = {word: name for name, words in zip(ENGLISH, MONTHS, strict=True) for word in words}
+# Only differences count: where one name stands everywhere, another zone of that name gives the same steps.
+ZONES = {
+    "UTC": "+0000", "GMT": "+0000", "WET": "+0000", "WEST": "+0100", "BST": "+0100", "CET": "+0100", "MEZ": "+0100",
+    "CEST": "+0200", "MESZ": "+0200", "EET": "+0200", "EEST": "+0300", "MSK": "+0300", "IST": "+0530", "JST": "+0900",
+    "AEST": "+1000", "AEDT": "+1100", "EST": "-0500", "EDT": "-0400", "CST": "-0600", "CDT": "-0500", "MST": "-0700",
+    "MDT": "-0600", "PST": "-0800", "PDT": "-0700", "BRT": "-0300",
+}  # fmt: skip
+WEEKDAY = re.compile(r"^([^\W\d_]{2,10})\.?,? +(?=(\d)|[^\W\d_]+\.? +\d)")
+MONTH = re.compile(r"(?<![^\W_])([^\W\d_]{3,10})(?:\.(?!\d))?(?![^\W\d_])")
+ZONE = re.compile(rf" ?\b({'|'.join(ZONES)})\b")
+YEAR_LAST = re.compile(r"^(\w+ \d+) (\d+:[\d:.,]+) ?([+-]\d{4})?,? (\d{4})$")
+JOINED = re.compile(r"(/\d{4}):(\d\d:)")
+OFFSET = re.compile(r"(:\d\d(?:[.,]\d+)?(?: [AaPp][Mm])?) ([+-]\d\d:?\d\d)$")
+DAY = re.compile(r"^(\d{1,2})\. ?(?=[^\W\d_])")
+
+
+def plain_date(stamp: str) -> str:
+    """A stamp without its day of the week, with an English month, the year beside it, and its offset behind the time.
+
+    "Thu Nov 26 21:00:00 CET 2026" becomes "Nov 26 2026 21:00:00+0100", "02. März 2026 06:00" "02 Mar 2026 06:00".
+    """
+    if not any(map(str.isalpha, stamp)):
+        return OFFSET.sub(r"\1\2", stamp)
+    first = WEEKDAY.match(stamp)
+    if first and not (first[2] and _month(first[1])):
+        stamp = stamp[first.end() :]
+    stamp = JOINED.sub(r"\1 \2", DAY.sub(r"\1 ", stamp))
+    stamp = MONTH.sub(lambda found: _month(found.group(1)) or found.group(0), stamp)
+    stamp = ZONE.sub(lambda found: " " + ZONES[found.group(1)], stamp)
+    moved = YEAR_LAST.match(stamp)
+    if moved:
+        stamp = f"{moved[1]} {moved[4]} {moved[2]} {moved[3] or ''}".strip()
+    return OFFSET.sub(r"\1\2", stamp)
+
+
+def _month(word: str) -> str | None:
+    letters = word.casefold()
+    if letters in ("am", "pm"):
+        return None
+    return BY_LETTERS.get(letters[:4]) or BY_LETTERS.get(letters[:3])
