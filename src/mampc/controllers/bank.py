@@ -68,6 +68,10 @@ class ControllerBank(Controller):
     def __repr__(self) -> str:
         return f"ControllerBank({self.variants!r})"
 
+    @property
+    def each(self) -> tuple[Controller, ...]:
+        return tuple(self.variants.values())
+
     def step(
         self, state: ControllerState, x: Any, reference: Any, *, variant: str | None = None, **now: Any
     ) -> Decision:

@@ -89,6 +89,11 @@ class Controller(ABC):
         return f"{type(self).__name__}({self.problem!r})"
 
     @property
+    def each(self) -> tuple[Controller, ...]:
+        """The controllers one of which decides a sample: itself, or the variants of a bank."""
+        return (self,)
+
+    @property
     def memory(self) -> int:
         """How many past inputs the controller looks back on."""
         return self._memory

@@ -27,6 +27,7 @@ from mampc.loop.simulation import Acting, Course, acting_on, at_rest
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.plants import Plant
+from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
 
 TOGETHER = 1000  # loops that are simulated as one array; more of them gain nothing
@@ -51,6 +52,8 @@ class Batch:
         dt: sample time in seconds.
         names: of the inputs and outputs.
         resolution: of each loop's inputs, as in `Run`, shape (S, m).
+        zone: of each loop, as in `Run`.
+        zone_told: as in `Run`.
     """
 
     t: Array
@@ -67,14 +70,18 @@ class Batch:
     dt: float
     names: Names
     resolution: Array
+    zone: tuple[Zone | None, ...]
+    zone_told: bool
 
     def __len__(self) -> int:
         return len(self.u)
 
     def __getitem__(self, loop: int) -> Run:
         """One loop as a run."""
-        own = ("u", "y", "y_measured", "r", "u_initial", "v", "position", "faults", "decisions", "resolution")
-        shared = ("t", "dt", "names")
+        own = (
+            "u", "y", "y_measured", "r", "u_initial", "v", "position", "faults", "decisions", "resolution", "zone"
+        )  # fmt: skip
+        shared = ("t", "dt", "names", "zone_told")
         return Run(
             **{name: getattr(self, name)[loop] for name in own},
             **{name: getattr(self, name) for name in shared},
@@ -146,7 +153,10 @@ def simulate_batch(
         "reference": reference, "input_disturbance": input_disturbance,
         "output_disturbance": output_disturbance, "measured_disturbance": measured_disturbance,
     }  # fmt: skip
-    each = {name for name, value in own.items() if value is not None and as_array(name, value).ndim == 3}
+    each = {
+        name for name, value in own.items()
+        if not isinstance(value, Zone | None) and as_array(name, value).ndim == 3
+    }  # fmt: skip
     for name, value in own.items():
         if name in each and len(value) != len(seeds):
             raise MampcError(
@@ -169,7 +179,8 @@ def simulate_batch(
     first, plans = regulators[0], None
     if not keep and all(_steps_like(own, first) for own in regulators):
         ahead = preview or first.reference_filter is not None
-        plans = batched_plans([own._planner for own in regulators], ahead)
+        if not isinstance(reference, Zone) or first.reference_filter is None:
+            plans = batched_plans([own._planner for own in regulators], ahead)
     model, T = first.controller.problem.model, len(courses[0])
     if any(own.controller.problem.model.dt != model.dt for own in regulators):
         raise MampcError("regulator: expected the same sample time in all, received several")
@@ -197,6 +208,10 @@ def simulate_batch(
         v=np.array([course.v for course in courses]), position=records.position, seeds=seeds,
         faults=tuple(records.faults), decisions=tuple(map(tuple, records.decisions)), dt=model.dt,
         names=plants[0].names, resolution=np.array([own.controller.resolution for own in regulators]),
+        zone=tuple(
+            course.ranges(own.controller) for course, own in zip(courses, regulators, strict=True)
+        ),
+        zone_told=isinstance(reference, Zone),
     )  # fmt: skip
 
 
@@ -254,6 +269,10 @@ class _Loops:
             np.array([getattr(course, name) for course in courses]).swapaxes(0, 1)
             for name in ("noise", "at_inputs", "at_outputs", "v", "reference")
         )
+        self._courses, zone = courses, courses[0].zone
+        if zone is not None:  # one for all loops
+            ends = regulator._planner.condensed.parameter.of_zones(zone)
+            self._reference = np.repeat(ends[:, None], len(courses), axis=1)
         start = np.array([course.u_initial for course in courses])
         first = np.concatenate([start, self._v[0]], axis=1)
         rests: dict[tuple[int, bytes], tuple[Array, RegulatorState]] = {}
@@ -312,7 +331,7 @@ class _Loops:
             course = self._filter.course(tracked, asked, regulator._samples)
             tracked, ahead = course[:, 0], course.reshape(len(y), -1)
         place = regulator._planner.condensed.parameter
-        ahead = place.with_ends(ahead.reshape(len(y), -1, y.shape[1])).reshape(len(y), -1)
+        ahead = place.with_ends(ahead.reshape(len(y), -1, asked.shape[-1])).reshape(len(y), -1)
         parameters = np.ones((len(y), place.one.stop + ahead.shape[1]))
         parameters[:, place.x], parameters[:, place.u_previous] = estimate.x, u
         parameters[:, place.u_deviation] = u
@@ -338,7 +357,7 @@ class _Loops:
         for loop in np.flatnonzero(decided) if any(active is not None for active in self._active) else ():
             self._active[loop] = None
         for s, state in zip(one_by_one, before, strict=True):
-            self._step_one(s, state, y[s], asked[s], told[s])
+            self._step_one(s, state, y[s], self._courses[s].asked(k, self._n_p and self._n_p + 1), told[s])
         return self._inputs[:, -1]
 
     def _state(self, s: int, k: int) -> RegulatorState:
@@ -353,7 +372,7 @@ class _Loops:
             None if self._tracked is None else self._tracked[s].copy(),
         )
 
-    def _step_one(self, s: int, state: RegulatorState, y: Array, asked: Array, v: Array) -> None:
+    def _step_one(self, s: int, state: RegulatorState, y: Array, asked: Array | Zone, v: Array) -> None:
         """An ordinary step of one loop."""
         told: dict[str, Any] = {"measured_disturbance": v} if self._has_v else {}
         decision = self._regulators[s].step(state, y, asked, **told)

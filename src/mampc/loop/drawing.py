@@ -22,6 +22,7 @@ from mampc.base.drawing import (
     time_scale,
 )
 from mampc.base.names import Names
+from mampc.program.zone import Zone
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,6 +49,8 @@ class Trajectory(Protocol):
     def y(self) -> Array: ...
     @property
     def r(self) -> Array: ...
+    @property
+    def zone(self) -> Zone | None: ...
     @property
     def names(self) -> Names: ...
 
@@ -110,7 +113,12 @@ def signals_figure(
                     zorder=style.order,
                     label=plain(controller),
                 )
-            if output:
+            if output and first.zone is not None and (first.zone.high > first.zone.low)[:, i].any():
+                panel.fill_between(
+                    first.t / scale, *_within(panel, first.zone.low[:, i], first.zone.high[:, i]), step="post",
+                    color=GREY, alpha=0.2, linewidth=0, zorder=1.0, label="zone",
+                )  # fmt: skip
+            elif output:
                 panel.step(
                     first.t / scale, first.r[:, i], where="post", color=BLACK, linestyle=(0, (4, 2)),
                     linewidth=0.9, zorder=4.2, label="reference",
@@ -125,6 +133,14 @@ def signals_figure(
         axes[-1, 0].set_xlim(0, float(first.t[-1]) / scale or None)
         legend_above(figure)
     return figure
+
+
+def _within(panel: Any, low: Array, high: Array) -> tuple[Array, Array]:
+    """Ends of a zone, cut to what a panel shows and a little more, so that far ones do not flatten the data."""
+    bottom, top = panel.get_ylim()
+    far = 0.3 * (top - bottom)
+    panel.set_ylim(bottom, top) if (low < bottom - far).any() or (high > top + far).any() else None
+    return np.maximum(low, bottom - far), np.minimum(high, top + far)
 
 
 def near_limits(limits: Any, output: bool, i: int, low: float, high: float) -> tuple[list[float], str]:

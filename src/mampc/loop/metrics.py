@@ -10,6 +10,7 @@ import numpy as np
 from mampc.base.checks import Array, as_number, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.base.tolerances import SAME
+from mampc.program.zone import Zone
 
 Counts = np.ndarray[tuple[int], np.dtype[np.int64]]
 
@@ -24,7 +25,11 @@ class Metrics:
         threshold: changes above it, in input units, count in `sparse_density`.
         sparse_density: share of samples at which the input changes by more than the threshold (eq. 10).
         exact_density: share of samples at which it changes at all.
-        tracking_error: mean over samples of |y - r|^2 (eq. 11), in squared output units.
+        tracking_error: mean over samples of |y - r|^2 (eq. 11), in squared output units; of outputs with a zone the
+            distance to it counts, which is nothing inside.
+        time_outside: share of samples at which an output is outside its zone, shape (l,); not-a-number without one.
+        mean_distance_outside: of an output from its zone at these samples, in output units, shape (l,); 0 where there
+            are none, not-a-number without a zone.
         moves: number of changes per input.
         travel: sum of |du|, in input units.
         reversals: how often an input moves against its previous move.
@@ -43,6 +48,8 @@ class Metrics:
     sparse_density: Array
     exact_density: Array
     tracking_error: float
+    time_outside: Array
+    mean_distance_outside: Array
     moves: Counts
     travel: Array
     reversals: Counts
@@ -66,6 +73,7 @@ def compute(
     dead_band: Any = 0.0,
     position: Array | None = None,
     resolution: Any = SAME,
+    zone: Zone | None = None,
 ) -> Metrics:
     """Metrics of a trajectory.
 
@@ -79,6 +87,8 @@ def compute(
         position: where the actuators were, shape (T, m), whose starts are counted; default the decided inputs.
         resolution: changes up to here are rounding and no moves, in input units, as in `Decision`; default 1e-9.
 
+        zone: within which outputs cost nothing, ends of shape (T, l); default none, as where they are the reference.
+
     Source: paper, eqs. 10 and 11.
 
     Raises:
@@ -91,6 +101,10 @@ def compute(
         raise MampcError(f"dead_band: expected numbers of at least 0, received {dead_band!r}")
     changes = np.diff(np.vstack([u_initial, u]), axis=0)[skip:]
     size = np.abs(changes)
+    low, high = (r, r) if zone is None else (zone.low, zone.high)
+    off = np.maximum(np.maximum(low - y, y - high), 0.0)[skip:]
+    outside, has_zone = off > 0, (high > low).any(axis=0)
+    mean_distance = off.sum(axis=0) / np.maximum(outside.sum(axis=0), 1)
     steps, smallest = len(size), as_vector("resolution", resolution, u.shape[1])
     moved = size > smallest
     moves = moved.sum(axis=0)
@@ -103,7 +117,9 @@ def compute(
         threshold=threshold,
         sparse_density=(size > threshold).sum(axis=0) / steps,
         exact_density=moves / steps,
-        tracking_error=float(np.mean(np.sum((y[skip:] - r[skip:]) ** 2, axis=1))),
+        tracking_error=float(np.mean(np.sum(off**2, axis=1))),
+        time_outside=np.where(has_zone, outside.mean(axis=0), np.nan),
+        mean_distance_outside=np.where(has_zone, mean_distance, np.nan),
         moves=moves,
         travel=np.where(moved, size, 0.0).sum(axis=0),
         reversals=np.array(

@@ -37,7 +37,7 @@ def closed_loops(
 ) -> Iterator[Moment]:
     """The loops sample by sample, each with its own plant (which may be the same), regulator and course."""
     model = regulators[0].controller.problem.model
-    ahead = [r.controller.problem.prediction_horizon + 1 if preview else 1 for r in regulators]
+    ahead = [r.controller.problem.prediction_horizon + 1 if preview else None for r in regulators]
     rests = [
         at_rest(plant, regulator, course.u_initial, course.v[0])
         for plant, regulator, course in zip(plants, regulators, courses, strict=True)
@@ -56,8 +56,7 @@ def closed_loops(
         position = np.empty_like(position)
         for s, (regulator, course) in enumerate(zip(regulators, courses, strict=True)):
             told = course.told(k, v[k, s] if model.n_disturbances else None)
-            reference = course.reference[k : k + ahead[s]] if preview else course.reference[k]
-            decision = regulator.step(states[s], measured[s], reference, **told)
+            decision = regulator.step(states[s], measured[s], course.asked(k, ahead[s]), **told)
             states[s], stem = decision.state, stems[s]
             if stem is not None:
                 stem = stems[s] = stem.moved(decision.u)

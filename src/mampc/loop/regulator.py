@@ -12,11 +12,9 @@ from mampc.base.checks import (
     Array,
     as_flag,
     as_instance,
-    as_read,
     as_shaped,
     as_vector,
     as_whole,
-    is_usable,
 )
 from mampc.base.errors import MampcError
 from mampc.controllers.bank import ControllerBank
@@ -168,7 +166,8 @@ class Regulator:
             if place == "controller.memory":  # what a rule around a controller keeps; it knows what fits
                 continue
             may_be_none = place in ("controller.guess", "controller.active")
-            if shape != expected[place] and not (may_be_none and shape is None):
+            zone = place == "reference" and expected[place] is not None and shape == (2, *self._y_shape)
+            if shape != expected[place] and not (may_be_none and shape is None) and not zone:
                 raise MampcError(f"state: expected {place} of shape {expected[place]}, received {shape}")
         for name in ("weights", "usual"):
             shares = getattr(state.estimate, name, np.ones(1))
@@ -207,8 +206,8 @@ class Regulator:
             y: measured outputs, shape (l,). Those not believed (not-a-number, masked, or refused by the sensor
                 checks) do not correct the estimate; `decision.ignored_outputs` names them. With none left the
                 inputs are held (see `max_blind_steps`).
-            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead; where there is a
-                reference filter, what it leads to.
+            reference: absolute outputs to track, shape (l,), or (np + 1, l) when known ahead, or a `Zone`; where
+                there is a reference filter, what it leads to.
             u_applied: what the plant really got since the last step, shape (m,), if not what was decided:
                 a saturated, stuck or late actuator, or one in manual. Not-a-number means as decided, and so do
                 a value within `applied_tolerance` and one a hundred times further outside its limits than these
@@ -249,8 +248,12 @@ class Regulator:
         if (state.command is None) is not (self._compensation is None):
             kind = "without" if self._compensation is None else "with"
             raise MampcError(f"state: expected one of a regulator {kind} valves, received another's")
-        if tracked is not None:
-            reference, tracked = self._filtered(tracked, reference, estimate, u_previous, v, manual)
+        if tracked is not None and self._filter is not None:
+            in_manual = self.controller.manual_inputs(manual)
+            reference, tracked = self._filter.update(
+                tracked, reference, self._samples, self._outputs(estimate, u_previous, v),
+                restart=in_manual is not None and bool(in_manual.all()),
+            )  # fmt: skip
         chosen: dict[str, Any] = {}
         if variant is not None:
             if not isinstance(self._planner, ControllerBank):
@@ -286,21 +289,6 @@ class Regulator:
             load=self.estimator.load(estimate),
             solve_time=perf_counter() - start,
         )
-
-    def _filtered(
-        self, last: Array, reference: Any, estimate: Estimate, u: Array, v: Array, manual: Any
-    ) -> tuple[Array, Array]:
-        """What is tracked over the horizon, shape (np + 1, l), and now, shape (l,)."""
-        assert self._filter is not None
-        asked = as_read("reference", reference)
-        asked = as_shaped("reference", asked, ((self._samples,) if asked.ndim == 2 else ()) + self._y_shape)
-        in_manual = self.controller.manual_inputs(manual)
-        if in_manual is not None and in_manual.all():
-            last = _where_usable(self._outputs(estimate, u, v), last)
-        if not is_usable(asked.ravel()):
-            return asked, last
-        course = self._filter.course(last, asked, self._samples)
-        return course, course[0]
 
     def _outputs(self, estimate: Estimate, u: Array, v: Array) -> Array:
         """The outputs estimated, shape (l,)."""

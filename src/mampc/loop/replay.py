@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,9 @@ from mampc.base.csv_table import CSVTable
 from mampc.base.errors import MampcError
 from mampc.base.names import Names
 from mampc.loop.regulator import Regulator
-from mampc.loop.run import Run, told
+from mampc.loop.run import ENDS, Run, told
 from mampc.loop.state import RegulatorState
+from mampc.program.zone import Zone
 
 SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
 
@@ -26,8 +28,8 @@ SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
 class Recording:
     """What a regulator was told in T samples of a simulated run, and what it decided, in engineering units.
 
-    (Neither applied inputs that differ from the decided ones, nor limits or zones of single samples, nor inputs in
-    manual; nor, with preview, a reference that goes on beyond the run.)
+    (Neither applied inputs that differ from the decided ones, nor limits of single samples, nor inputs in manual; nor,
+    with preview, a reference that goes on beyond the run.)
 
     Attributes:
         t: seconds, shape (T,).
@@ -39,6 +41,7 @@ class Recording:
         status, remarks, ignored, load: of each decision, as text.
         variant: which controller of a `ControllerBank` decided, by name; empty words where there is none.
         names: of the signals.
+        zone: told in place of the references, ends of shape (T, l); None where none was.
     """
 
     t: Array
@@ -53,6 +56,7 @@ class Recording:
     load: tuple[str, ...]
     variant: tuple[str, ...]
     names: Names
+    zone: Zone | None = None
 
     @classmethod
     def of(cls, run: Run) -> Recording:
@@ -76,6 +80,7 @@ class Recording:
             load,
             variant,
             run.names,
+            run.zone if run.zone_told else None,
         )
 
     @classmethod
@@ -87,10 +92,13 @@ class Recording:
             read = [table.numbers(word, finite=finite) for word in words]
             return np.array(read).reshape(len(words), len(table)).T
 
+        zone = None
+        if f"{names.outputs[0]}_{ENDS[0]}" in table.header:
+            zone = Zone(*(columns([f"{name}_{end}" for name in names.outputs], finite=False) for end in ENDS))
         return cls(
             table.numbers("time"),
             columns([f"{name}_measured" for name in names.outputs], finite=False),
-            columns([f"{name}_reference" for name in names.outputs]),
+            columns([f"{name}_reference" for name in names.outputs], finite=zone is None),
             columns(list(names.disturbances)),
             columns(list(names.inputs)),
             table.numbers("objective", finite=False),
@@ -100,6 +108,7 @@ class Recording:
             tuple(table.words("load")),
             tuple(table.words("variant")),
             names,
+            zone,
         )
 
 
@@ -150,11 +159,14 @@ def replay(
         )
     horizon = regulator.controller.problem.prediction_horizon
     for k, t in enumerate(recording.t.tolist()):
-        ahead = np.minimum(np.arange(k, k + horizon + 1), len(recording.t) - 1)
+        part: Any = np.minimum(np.arange(k, k + horizon + 1), len(recording.t) - 1) if preview else k
+        asked: Any = recording.r[part]
+        if recording.zone is not None:
+            asked = Zone(recording.zone.low[part], recording.zone.high[part])
         decision = regulator.step(
             state,
             recording.y[k],
-            recording.r[ahead] if preview else recording.r[k],
+            asked,
             measured_disturbance=recording.v[k] if model.n_disturbances else None,
             variant=recording.variant[k] or None,
         )

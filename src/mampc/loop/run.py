@@ -19,6 +19,9 @@ from mampc.controllers.decision import Decision
 from mampc.loop import metrics
 from mampc.loop.metrics import Metrics
 from mampc.program.problem import Limits
+from mampc.program.zone import Zone
+
+ENDS = ("zone_low", "zone_high")  # of zones, in names of columns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,6 +44,8 @@ class Run:
         position: where the actuators were, shape (T, m): the decided inputs unless there are `Valves`.
         dt: sample time in seconds.
         names: of the inputs and outputs.
+        zone: within which outputs cost nothing, ends of shape (T, l); None where all have set points.
+        zone_told: whether the regulator was told this zone in place of the reference, which then is its middle.
         resolution: changes up to here are rounding and no moves, in input units, shape (m,), as in `Decision`; 1e-9
             unless the controller says otherwise.
     """
@@ -58,6 +63,8 @@ class Run:
     faults: dict[int, tuple[str, ...]]
     position: Array = None  # type: ignore[assignment]  # always set after construction
     resolution: Array = None  # type: ignore[assignment]  # as above
+    zone: Zone | None = None
+    zone_told: bool = False
 
     def __post_init__(self) -> None:
         if self.resolution is None:
@@ -77,7 +84,7 @@ class Run:
         return metrics.compute(
             self.u, self.y, self.r, self.u_initial, self.dt,
             threshold=threshold, skip=skip, dead_band=dead_band, position=self.position,
-            resolution=self.resolution,
+            resolution=self.resolution, zone=self.zone,
         )  # fmt: skip
 
     @property
@@ -114,7 +121,8 @@ class Run:
 
     def to_csv(self, path: str | Path) -> None:
         """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs,
-        what loads seem to do and variant, in full precision; and where the actuators were, if not as told.
+        what loads seem to do and variant, in full precision; and where the actuators were, if not as told, and the
+        ends of the zone, if it was told.
         """
         if len(self.decisions) != len(self.t):
             raise MampcError(
@@ -132,6 +140,10 @@ class Run:
         if not np.array_equal(self.position, self.u):
             header += [f"{u}_position" for u in inputs]
             positions = self.position.tolist()
+        if self.zone is not None and self.zone_told:
+            header += [f"{y}_{end}" for end in ENDS for y in outputs]
+            ends = np.hstack([self.zone.low, self.zone.high]).tolist()
+            positions = [own + row for own, row in zip(positions, ends, strict=True)]
         with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)

@@ -12,6 +12,8 @@ from mampc.base.checks import Array, as_array, as_matrix, as_vector, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.base.progress import watched
+from mampc.controllers.bank import ControllerBank
+from mampc.controllers.controller import Controller
 from mampc.loop.loads import Load, drawn
 from mampc.loop.motion import Faults, motion_of
 from mampc.loop.regulator import Regulator
@@ -19,6 +21,7 @@ from mampc.loop.run import Run
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Stems, Valves
 from mampc.plants import Plant
+from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
 
 LONGEST_RUN = 10_000_000  # samples
@@ -47,7 +50,7 @@ def simulate(
     Args:
         plant: a nonlinear plant, or a discrete `StateSpace` standing in for one.
         regulator: output feedback; its model's sample time is that of the loop.
-        reference: absolute outputs to track: constant (l,), or one row per sample (T, l).
+        reference: absolute outputs to track: constant (l,), or one row per sample (T, l); or a `Zone` of these shapes.
         steps: T; default the rows of the reference.
         noise: standard deviation of Gaussian measurement noise, scalar or (l,), in output units.
         seed: of noise and loads; equal seeds give equal ones whatever the regulator.
@@ -80,6 +83,7 @@ class Course:
 
     Attributes:
         reference: as long as it is predicted, shape (T + np, l).
+        zone: asked for in place of the reference, its ends of the same shape; None where none is.
         noise: of the measurements, shape (T, l).
         at_inputs, at_outputs: unmeasured disturbances, shapes (T, m) and (T, l).
         v: measured disturbances, shape (T, d).
@@ -89,6 +93,7 @@ class Course:
     """
 
     reference: Array
+    zone: Zone | None
     noise: Array
     at_inputs: Array
     at_outputs: Array
@@ -96,6 +101,29 @@ class Course:
     u_initial: Array
     stems: Stems | None
     variants: Sequence[str] | None
+
+    def asked(self, k: int, samples: int | None) -> Array | Zone:
+        """What the regulator is asked for at sample k: of this one, or of so many from it on where it sees ahead."""
+        part = k if samples is None else slice(k, k + samples)
+        if self.zone is None:
+            return self.reference[part]
+        return Zone(self.zone.low[part], self.zone.high[part])
+
+    def ranges(self, controller: Controller) -> Zone | None:
+        """Within which outputs cost nothing, ends of shape (T, l); None where all have set points."""
+        T = len(self)
+        if self.zone is not None:
+            return Zone(self.zone.low[:T], self.zone.high[:T])
+        problems = [controller.problem]
+        if isinstance(controller, ControllerBank):
+            names = [controller.usual] if self.variants is None else self.variants
+            problems = [controller.variants[name].problem for name in names]
+        below, above = (
+            np.array([getattr(p, name) for p in problems]) for name in ("zone_below", "zone_above")
+        )
+        if not below.any() and not above.any():
+            return None
+        return Zone(self.reference[:T] - below, self.reference[:T] + above)
 
     def told(self, k: int, v: Array | None) -> dict[str, Any]:
         """What the regulator is told at a sample beside measurements and reference; v its measured disturbances."""
@@ -112,7 +140,7 @@ class Acting:
 
     Attributes:
         dt: sample time in seconds.
-        reference, u_initial, stems, variants: as in `Course`.
+        reference, zone, u_initial, stems, variants: as in `Course`.
         spread: standard deviation of the noise, shape (l,).
         at: disturbances by place, shapes (T, m), (T, l) and (T, d).
         loads: to be drawn.
@@ -120,6 +148,7 @@ class Acting:
 
     dt: float
     reference: Array
+    zone: Zone | None
     spread: Array
     at: dict[str, Array]
     loads: Sequence[Load]
@@ -137,6 +166,7 @@ class Acting:
         noise = self.spread * np.random.default_rng(seed).standard_normal((T, len(self.spread)))
         return Course(
             self.reference,
+            self.zone,
             noise,
             at["input"],
             at["output"],
@@ -174,10 +204,23 @@ def acting_on(
             f"simulate: expected a plant with {m} inputs, {l} outputs and {model.n_disturbances} measured "
             f"disturbances, received {len(plant.names.inputs)}, {len(plant.names.outputs)} and {d}"
         )
-    reference = as_array("reference", reference)
+    zone = reference if isinstance(reference, Zone) else None
+    reference = as_array("reference", reference) if zone is None else zone.centre
     T = _length(reference, steps)
-    rows = _trajectory("reference", reference, l, None if reference.ndim == 2 else T)
-    horizon = regulator.controller.problem.prediction_horizon
+    if zone is None:
+        rows = _trajectory("reference", reference, l, None if reference.ndim == 2 else T)
+    elif reference.shape[-1] == l and len(reference) > 0:
+        rows = np.tile(reference, (1 if reference.ndim == 2 else T, 1))
+    else:
+        raise MampcError(
+            f"reference: expected a Zone of shape ({l},) or (T, {l}), received {reference.shape}"
+        )
+    ahead = np.minimum(np.arange(T + regulator.controller.problem.prediction_horizon), len(rows) - 1)
+    if zone is not None:
+        low, high = (np.broadcast_to(end, rows.shape)[ahead] for end in (zone.low, zone.high))
+        zone = Zone(low, high)
+        for controller in regulator.controller.each:
+            controller.condensed.parameter.of_zones(zone)  # complains where it does not fit
     spread = as_vector("noise", noise, l)
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
@@ -191,7 +234,7 @@ def acting_on(
         raise MampcError(f"valves: expected mampc.Valves, received {type(valves).__name__}")
     start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
     return Acting(
-        dt=model.dt, reference=rows[np.minimum(np.arange(T + horizon), len(rows) - 1)], spread=spread, at=at,
+        dt=model.dt, reference=rows[ahead], zone=zone, spread=spread, at=at,
         loads=loads, u_initial=start, stems=None if valves is None else valves.initial(start),
         variants=_variants(variant, T),
     )  # fmt: skip
@@ -207,7 +250,7 @@ def closed_loop(
 ) -> Run:
     """The loop sample by sample."""
     model, horizon = regulator.controller.problem.model, regulator.controller.problem.prediction_horizon
-    T, start, v, r = len(course), course.u_initial, course.v, course.reference[: len(course)]
+    T, start, v, ahead = len(course), course.u_initial, course.v, horizon + 1 if preview else None
     motion = motion_of(plant, model.dt)
     x, state = at_rest(plant, regulator, start, v[0])
     shape = (T, len(start))
@@ -218,11 +261,10 @@ def closed_loop(
         outputs[k] = (
             motion.output(x, np.concatenate([position + course.at_inputs[k], v[k]])) + course.at_outputs[k]
         )
-        ahead = course.reference[k : k + horizon + 1] if preview else r[k]
         decision = regulator.step(
             state,
             outputs[k] + course.noise[k],
-            ahead,
+            course.asked(k, ahead),
             **course.told(k, v[k] if model.n_disturbances else None),
         )
         state, position = decision.state, decision.u
@@ -238,9 +280,10 @@ def closed_loop(
         if wrong:
             found[k] = wrong
     return Run(
-        t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + course.noise, r=r, u_initial=start,
-        decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found, position=positions,
-        resolution=regulator.controller.resolution,
+        t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + course.noise, r=course.reference[:T],
+        u_initial=start, decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found,
+        position=positions, resolution=regulator.controller.resolution, zone=course.ranges(regulator.controller),
+        zone_told=course.zone is not None,
     )  # fmt: skip
 
 

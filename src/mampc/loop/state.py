@@ -29,7 +29,8 @@ class RegulatorState:
         measured_disturbance: as last reported, shape (d,).
         sensors: what the sensor checks remember.
         actuators: what is remembered of the actuators.
-        reference: tracked last, shape (l,), where a reference filter leads to the ones given; else None.
+        reference: tracked last, shape (l,), or the ends of a zone, shape (2, l), where a reference filter leads to what
+            is asked for; else None.
         command: inputs decided last, shape (m,), where valves are compensated, whose positions the controller has in
             place of them; else None.
     """

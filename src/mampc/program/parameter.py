@@ -109,6 +109,10 @@ class Parameter:
         """What stands in p for a zone; `MampcError` if it does not fit the problem."""
         return (ZoneEnds(self._problem) if self._ends is None else self._ends).of(zone)
 
+    def of_zones(self, zone: Zone) -> Array:
+        """The same for any number of samples, shape (T, l + zoned)."""
+        return (ZoneEnds(self._problem) if self._ends is None else self._ends).of_rows(zone)
+
     def no_map(self, rows: int) -> Array:
         """A map of p to `rows` zeros, shape (rows, size), to be filled in."""
         return np.zeros((rows, self.size))

@@ -43,6 +43,15 @@ class Zone:
             kept.setflags(write=False)
             object.__setattr__(self, name, kept)
 
+    @property
+    def centre(self) -> Array:
+        """The middle, or the only end there is; the shape of the ends, not-a-number where there is none."""
+        low, high = (
+            np.where(np.isinf(self.low), self.high, self.low),
+            np.where(np.isinf(self.high), self.low, self.high),
+        )
+        return np.where(np.isinf(low), np.nan, low + (high - low) / 2)
+
 
 class ZoneEnds:
     """The ends of zones as the parameter of a sample holds them: those of outputs without one are the reference.
@@ -74,6 +83,10 @@ class ZoneEnds:
             raise MampcError(
                 f"reference: expected a Zone of shape {' or '.join(map(str, self._shapes))}, received {zone.low.shape}"
             )
+        return self.of_rows(zone)
+
+    def of_rows(self, zone: Zone) -> Array:
+        """The same for any number of samples, shape (..., l + zoned)."""
         low, high = zone.low[..., self._single], zone.high[..., self._single]
         if ((low != high) & ~(np.isnan(low) | np.isnan(high))).any():
             raise MampcError(

@@ -112,7 +112,8 @@ def moves_against_error(
             style = look[controller]
             markers += panel.plot(*points[-1], "o", color=style.colour, markersize=7, zorder=style.order)
         panel.set_xlabel(f"samples with a move above {threshold:g}, mean of all inputs (%)")
-        panel.set_ylabel("tracking error, mean |y − r|²")
+        zones = any(run.zone is not None for run in runs.values())
+        panel.set_ylabel("squared distance outside, mean" if zones else "tracking error, mean |y − r|²")
         right, top = np.max(points, axis=0)
         panel.set_xlim(0, 1.2 * right or 1.0)
         panel.set_ylim(0, 1.2 * top or 1.0)

@@ -23,7 +23,7 @@ from mampc.loop.drawing import near_limits
 from mampc.loop.metrics import Metrics
 from mampc.loop.run import Run
 from mampc.report.figures import result_looks
-from mampc.report.tables import baseline
+from mampc.report.tables import baseline, has_zones
 from mampc.study import StudyResult
 from mampc.study.schema import Study
 
@@ -128,7 +128,8 @@ def interactive_page(result: StudyResult, means: Means | None = None) -> str:
         "sentence": first["choices"][first["first"]]["sentence"],
         "shown": shown,
         "rate": f"Moves above {study.threshold:g}, but all of them in the travel. The run lasts {_duration(seconds)}; "
-        "a day is counted at its rate, steps of the reference included.",
+        "a day is counted at its rate, steps of the reference included."
+        + (" Errors are squared distances from the zones." if has_zones(study) else ""),
     }
     text = {name: html.escape(part) for name, part in parts.items()}
     return _PAGE.format(
@@ -172,7 +173,7 @@ def _content(result: StudyResult, means: Means | None) -> tuple[dict[str, Any], 
         "x": f"moves a day above {study.threshold:g}" if means is None else "moves a day",
         "log": means is not None
         and all(x > 0 for points in means.points.values() for x, _ in points.values()),
-        "y": "tracking error, mean |y − r|²",
+        "y": f"{'squared distance outside, mean' if has_zones(study) else 'tracking error, mean |y − r|²'}",
         "unit": unit,
         "scenarios": scenarios,
     }
@@ -202,7 +203,8 @@ def _scenario(
     for output, group in ((True, names.outputs), (False, names.inputs)):
         for i, signal in enumerate(group):
             data = [run.y[:, i] if output else run.u[:, i] for run in runs.values()]
-            data += [first.r[:, i]] if output else []
+            asked = first.r[:, i] if output and np.isfinite(first.r[:, i]).all() else None
+            data += [] if asked is None else [asked]
             low, high = min(float(d.min()) for d in data), max(float(d.max()) for d in data)
             margin = 0.06 * (high - low) or 0.01 * abs(high) or 1.0
             limits, told = near_limits(study.problem.limits, output, i, low - margin, high + margin)
@@ -216,7 +218,7 @@ def _scenario(
                 "title": names.with_unit(signal) + told, "staircase": not output, "limits": limits,
                 "range": [min(ends), max(ends)],
             })  # fmt: skip
-            reference.append(_thinned(first.r[:, i], step) if output else None)
+            reference.append(None if asked is None else _thinned(asked, step))
     choices = []
     for controller in order:
         x, y = points[controller]

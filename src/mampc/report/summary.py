@@ -63,6 +63,10 @@ def _controller(run: Run, study: Study, ratings: Ratings) -> dict[str, Any]:
     }
 
 
+def _known(values: Array) -> list[float | None]:
+    return [None if np.isnan(value) else value for value in values.tolist()]
+
+
 def _gap(gaps: Array) -> dict[str, float | None]:
     """How many decisions are proven best, and how far the others may be from that, where a bound is known."""
     bounded = gaps[np.isfinite(gaps)]
@@ -83,6 +87,8 @@ def _metrics(run: Run, threshold: float, skip: int, ratings: Ratings) -> dict[st
             "exact_per_input": metrics.exact_density.tolist(),
         },
         "tracking_error": metrics.tracking_error,
+        "time_outside_per_output": _known(metrics.time_outside),
+        "mean_distance_outside_per_output": _known(metrics.mean_distance_outside),
         "travel_per_input": metrics.travel.tolist(),
         "moves": int(metrics.moves.sum()),
         "moves_per_input": metrics.moves.tolist(),

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
 from mampc.study.schema import ControllerTable, PublishedTable, Study
+
+OUTSIDE = (("time_outside", ".0%"), ("mean_distance_outside", ".3g"))  # of zones: key and how it is shown
 
 
 def comparison_tables(study: Study, summary: dict[str, Any]) -> list[Table]:
@@ -22,13 +25,24 @@ def comparison_tables(study: Study, summary: dict[str, Any]) -> list[Table]:
     return tables
 
 
+def has_zones(study: Study) -> bool:
+    """Whether errors are counted from zones, for some outputs or some of the time."""
+    widths = (study.problem.zone_below, study.problem.zone_above)
+    return bool(study.reference.zones) or any(np.any(width) for width in widths)
+
+
+def _outside(entry: dict[str, Any], key: str, form: str) -> str:
+    """One value an output, a dash for set points."""
+    return " ".join("-" if value is None else f"{value:{form}}" for value in entry[f"{key}_per_output"])
+
+
 def baseline(study: Study) -> ControllerTable:
     """The controller that ratios refer to: the first plain MPC, or the first of all."""
     return next((table for table in study.controllers if table.method == "mpc"), study.controllers[0])
 
 
 def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
-    base = baseline(study)
+    base, zones = baseline(study), has_zones(study)
     samples = f"all {study.steps} samples" if part is None else f"without the first {study.skip} samples"
     table = Table(
         title=escape(f"{study.name}, {scenario['name']} — {samples}"),
@@ -40,7 +54,8 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
     headers = [
         f"changes\n> {study.threshold:g}",
         "changes\nat all",
-        "tracking\nerror",
+        "distance²\noutside" if zones else "tracking\nerror",
+        *(("time\noutside", "mean distance\noutside") if zones else ()),
         f"changes, error\n/ {escape(base.name)}",
     ]
     headers += (
@@ -58,6 +73,7 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
             _several(density["per_input"]),
             _several(density["exact_per_input"]),
             f"{entry['tracking_error']:.3f}",
+            *(_outside(entry, key, form) for key, form in OUTSIDE if zones),
             _ratios(
                 density["per_input"], reference["sparse_density"]["per_input"],
                 entry["tracking_error"], reference["tracking_error"],

@@ -26,6 +26,7 @@ from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.plants import Plant
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.zone import Zone
 from mampc.rivals.registry import RIVALS, rival
 from mampc.study.cautions import cautions
 from mampc.study.plugins import make_plant
@@ -252,7 +253,7 @@ def _acting(study: Study, prepared: Prepared, scenario: ScenarioTable) -> dict[s
         return None if value is None else _disturbance(study, scenario, value, usual)
 
     return {
-        "reference": _reference(study, prepared),
+        "reference": _asked(study, prepared),
         "noise": scenario.noise,
         "input_disturbance": disturbance(scenario.input_disturbance, np.zeros(model.n_inputs)),
         "output_disturbance": disturbance(scenario.output_disturbance, np.zeros(model.n_outputs)),
@@ -391,6 +392,22 @@ def _reference(study: Study, prepared: Prepared) -> Array:
     if isinstance(plant, StateSpace):
         return staircase + plant.response(usual[None], plant.steady_state(usual))
     return staircase + np.asarray(plant.output(plant.steady_state(usual), usual))
+
+
+def _asked(study: Study, prepared: Prepared) -> Array | Zone:
+    """The reference, or zones about it where these change their widths."""
+    reference = _reference(study, prepared)
+    if not study.reference.zones:
+        return reference
+    l, problem = reference.shape[1], _problem(study, prepared.model)
+    below, above = (np.tile(width, (study.steps, 1)) for width in (problem.zone_below, problem.zone_above))
+    try:
+        for zone in sorted(study.reference.zones, key=lambda zone: zone.at):
+            for widths, given in ((below, zone.below), (above, zone.above)):
+                widths[zone.at :] = np.broadcast_to(np.asarray(given, dtype=float), l)
+    except ValueError:
+        raise StudyError(f"reference.zones: expected widths of {l} outputs, or one for all") from None
+    return Zone(reference - below, reference + above)
 
 
 def _faults(runs: dict[str, dict[str, Run]]) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from mampc.base.errors import MampcError
 from mampc.loop import loads
 from mampc.loop.loads import Load
 from mampc.loop.valves import Valves
-from mampc.study.values import Lag, Name, Number, Seed, Table, Time, Values, Whole, Word
+from mampc.study.values import Lag, Name, Number, Seed, Table, Time, Values, Whole, Widths, Word
 
 
 class ChangeTable(Table):
@@ -19,11 +19,20 @@ class ChangeTable(Table):
     value: Values
 
 
+class ZoneTable(Table):
+    """From a sample on, other widths of the zones about the reference."""
+
+    at: Whole
+    below: Widths
+    above: Widths
+
+
 class ReferenceTable(Table):
     relative: bool = True
     preview: bool = False
     initial: list[Number]
     changes: list[ChangeTable] = []
+    zones: list[ZoneTable] = []
 
 
 LOADS = {
