@@ -24,6 +24,7 @@ from mampc.controllers.controller import Controller
 from mampc.methods import Exact
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.program.condensing import CondensedQP
+from mampc.program.restriction import excess_table
 from mampc.program.sample import Optimum, Sample
 from mampc.rivals.rules import DeadBand, Rounded, Rule
 
@@ -89,15 +90,7 @@ class PatternTable:
         self.size = np.linalg.norm(U, axis=0)
         U = U / self.size  # in units that make all moves alike
         self._rows, self._columns = np.triu_indices(len(U))
-        doubled = np.where(self._rows == self._columns, 1.0, 2.0)
-        self._table = np.empty((len(self._rows), len(patterns)))
-        for column, pattern in enumerate(patterns):
-            last, kept = np.flatnonzero(~pattern), int(pattern.sum())
-            columns = np.concatenate([np.flatnonzero(pattern), last])
-            triangle = np.asarray(np.linalg.qr(U[:, columns], mode="r"))[kept:, kept:]
-            excess = np.zeros_like(U)
-            excess[np.ix_(last, last)] = triangle.T @ triangle
-            self._table[:, column] = excess[self._rows, self._columns] * doubled
+        self._table = np.ascontiguousarray(excess_table(U, patterns).T)
         # Of the sum of |d*_i d*_k| in those units: what rounding may do to a cost.
         self.rounding = 1e-13 + 100 * np.finfo(float).eps * float(np.linalg.cond(U))
         self._maps: OrderedDict[int, Maps] = OrderedDict()
@@ -135,8 +128,8 @@ class BatchedExact(BatchedPlans):
         super().__init__(controller, preview)
         self._admissible, self._patterns = admissible, patterns
         self._information = controller.information
-        self._counts = np.array([admissible.count(pattern) for pattern in patterns])
-        self._charge = np.array([admissible.charge(pattern) for pattern in patterns])
+        self._counts = admissible.counts(patterns)
+        self._charge = admissible.charges(patterns)
         table: PatternTable | None = like.table if isinstance(like, BatchedExact) else None
         if table is None or not np.array_equal(table.patterns, patterns):
             table = PatternTable(self._condensed, patterns, self._units, self._m)

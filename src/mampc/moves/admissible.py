@@ -15,6 +15,7 @@ from mampc.base.checks import Array, BoolArray, as_vector
 from mampc.base.errors import MampcError
 from mampc.base.tolerances import SAME
 from mampc.moves.rules import MoveRules
+from mampc.program.sample import Indices
 
 
 class Allowance(NamedTuple):
@@ -135,6 +136,22 @@ class AdmissiblePatterns:
         if self.simultaneous:
             return float(self.price[0] * moved.any(axis=1).sum())
         return float(moved.sum(axis=0) @ self.price)
+
+    def counts(self, patterns: BoolArray) -> Indices:
+        """`count` of each of many patterns, shape (K, n_moves)."""
+        moved = patterns.reshape(len(patterns), -1, self.n_inputs)
+        counts: Indices = (moved.any(axis=2) if self.simultaneous else patterns).sum(axis=1)
+        return counts
+
+    def charges(self, patterns: BoolArray) -> Array:
+        """`charge` of each of many patterns, shape (K, n_moves)."""
+        moved = patterns.reshape(len(patterns), -1, self.n_inputs)
+        charges: Array = (
+            self.price[0] * moved.any(axis=2).sum(axis=1)
+            if self.simultaneous
+            else moved.sum(axis=1) @ self.price
+        )
+        return charges
 
     def allows(self, pattern: BoolArray, allowance: Allowance) -> bool:
         """Whether a pattern, shape (n_moves,), is admissible."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -94,3 +95,32 @@ class Restriction:
         multipliers[self.bounds] = nearest.multipliers
         moves, excess, _, status, iterations, violated = nearest
         return Nearest(moves, excess, multipliers, status, iterations, violated)
+
+
+def by_count(patterns: BoolArray) -> Iterator[tuple[Indices, Indices]]:
+    """Which patterns have equally many moves, and what these are: shapes (r,) and (r, k), for each k that occurs."""
+    counts = patterns.sum(axis=1)
+    for k in np.unique(counts).tolist():
+        which = np.flatnonzero(counts == k)
+        yield which, np.nonzero(patterns[which])[1].reshape(len(which), k)
+
+
+def excess_table(U: Array, patterns: BoolArray) -> Array:
+    """What optima on patterns cost more than the optimum d* of all moves, no limits given.
+
+    Args:
+        U: of `CondensedQP`, its columns scaled as d* is.
+        patterns: shape (K, n_moves).
+
+    Returns:
+        Shape (K, n_moves (n_moves + 1) / 2): to be multiplied by the products d*_i d*_k, i <= k, of `np.triu_indices`.
+    """
+    rows, columns = np.triu_indices(U.shape[1])
+    doubled = np.where(rows == columns, 1.0, 2.0)
+    table = np.empty((len(patterns), len(rows)))
+    for which, moves in by_count(patterns):
+        Q = np.linalg.qr(U[:, moves].transpose(1, 0, 2), mode="complete")[0]
+        missed = Q[:, :, moves.shape[1] :].transpose(0, 2, 1)
+        V = missed @ np.where(patterns[which][:, None, :], 0.0, U)
+        table[which] = (V.transpose(0, 2, 1) @ V)[:, rows, columns] * doubled
+    return table

@@ -20,6 +20,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.program.condensing import ROUNDING, CondensedQP
+from mampc.program.restriction import by_count, excess_table
 from mampc.program.sample import Indices, LaterData, LeastSquares, Optimum, PatternOptimum, Sample
 
 LARGEST_TABLE = 1_000_000  # entries; from here on the tree search is faster
@@ -37,7 +38,7 @@ class Ranking:
 
     def __init__(self, condensed: CondensedQP, admissible: AdmissiblePatterns, patterns: BoolArray) -> None:
         self.condensed, self.admissible = condensed, admissible
-        counts = np.array([admissible.count(pattern) for pattern in patterns])
+        counts = admissible.counts(patterns)
         order = np.argsort(counts, kind="stable")
         self.patterns: BoolArray = patterns[order]
         ends = np.searchsorted(counts[order], np.arange(counts.max() + 1), side="right").tolist()
@@ -45,23 +46,19 @@ class Ranking:
         nested = admissible.nested
         starts = [0, *ends[:-1]] if nested else [0] * len(ends)
         self._rows_within = [slice(start, end) for start, end in zip(starts, ends, strict=True)]
-        self.charge = np.array([admissible.charge(pattern) for pattern in self.patterns])
+        self.charge = admissible.charges(self.patterns)
         n = condensed.n_moves
         self._rows, self._columns = np.triu_indices(n)
-        doubled = np.where(self._rows == self._columns, 1.0, 2.0)
         unit_columns = condensed.U / condensed.lengths
+        self.table = excess_table(unit_columns, self.patterns)
         if admissible.sized:
             self._optima, self._stiffness = np.zeros((len(patterns), n, n)), np.ones((len(patterns), n))
             self._sizes = np.where(self.patterns, admissible.min_size, 0.0)
-        self.table = np.empty((len(patterns), len(self._rows)))
-        for k, pattern in enumerate(self.patterns):
-            restriction = condensed.restricted(pattern)
-            V = restriction.missed @ np.where(pattern, 0.0, unit_columns)
-            self.table[k] = (V.T @ V)[self._rows, self._columns] * doubled
-            if admissible.sized:
-                self._optima[k, pattern] = restriction.optimum(unit_columns)
-                inverse = np.linalg.inv(restriction.R)
-                self._stiffness[k, pattern] = 1 / np.square(inverse).sum(axis=1)
+            for which, moves in by_count(self.patterns):
+                Q, R = np.linalg.qr(condensed.U[:, moves].transpose(1, 0, 2))
+                inverse = np.linalg.inv(R)
+                self._optima[which[:, None], moves] = inverse @ (Q.transpose(0, 2, 1) @ unit_columns)
+                self._stiffness[which[:, None], moves] = 1 / np.square(inverse).sum(axis=2)
         self._kept: OrderedDict[int, PatternOptimum] = OrderedDict()
         self._most_kept = max(64, int(CACHE_BYTES / condensed.map_bytes))
 
