@@ -10,6 +10,8 @@ export VIRTUAL_ENV := $(CURDIR)/.venv
 # One thread a process: the tests and benchmarks share the cores among processes, and small matrices gain nothing.
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# Compiled modules are kept, or every process of the tests compiles them again.
+unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
 .PHONY: demo test deep coverage fuzz lint format bench conditioning methods attention figures lock clean help
