@@ -50,10 +50,10 @@ def estimator_of(case: Case, drift: float | str) -> Any:
 
 def regulators_of(case: Case, method: str, structure: tuple, knobs: Any) -> list[mampc.Regulator]:
     """One method with one structure at some values of its knob, which counts in units of noise."""
-    drift, tail, lighter = structure
+    drift, tail, lighter, *kind = structure
     unit, sigma, name = per_input(case), case.noise, method.removesuffix(", load bank")
     ours = name == "exact price"
-    problem = problem_of(case, lighter=lighter, tail=tail, moves=3) if ours else problem_of(case)
+    problem = problem_of(case, lighter=lighter, tail=tail, moves=3 if ours else 5)
     mpc, estimator = mampc.MPC(problem), estimator_of(case, drift)
     make = {
         "MPC": lambda knob: mpc,
@@ -62,15 +62,26 @@ def regulators_of(case: Case, method: str, structure: tuple, knobs: Any) -> list
         "rounding, hysteresis": lambda knob: rivals.Rounded(mpc, step=knob * unit, hysteresis=0.4),
         "event-triggered": lambda knob: rivals.EventTriggered(mpc, threshold=knob * sigma),
         "l1 on moves": lambda knob: rivals.Penalised(problem, penalty=rivals.L1(weight=10 * knob, size=unit)),
+        "elastic net on moves": lambda knob: rivals.Penalised(
+            problem, penalty=rivals.ElasticNet(weight=10 * knob, size=unit)
+        ),
+        "concave penalty on moves": lambda knob: rivals.Penalised(
+            problem, penalty=CONCAVE[kind[0]](weight=10 * knob, size=unit)
+        ),
+        "l0 on inputs": lambda knob: rivals.SparseInputs(
+            problem_of(case, lighter=knob), most=max(len(unit) - 1, 1)
+        ),
+        "self-triggered": lambda knob: rivals.SelfTriggered(mpc, longest=int(np.clip(np.ceil(5 * knob), 1, 100))),
         "exact price": lambda knob: mampc.MAMPC(problem, mampc.MoveRules(price=100 * knob)),
     }[name]  # fmt: skip
-    return [
-        mampc.Regulator(make(float(knob)), estimator, value_of_information=drift == "bank") for knob in knobs
-    ]
+    informed = ours and drift == "bank"
+    return [mampc.Regulator(make(float(knob)), estimator, value_of_information=informed) for knob in knobs]
 
 
+CONCAVE = {"SCAD": rivals.SCAD, "MCP": rivals.MCP, "log-sum": rivals.LogSum}
 BASELINE = "MPC", (0.3, 0.0, 1.0)
 DRIFTS = tuple((drift, 0.0, 1.0) for drift in (0.1, 0.3, 1.0))
+BANKS = ("bank", 0.0, 1.0), ("bank", 20.0, 1.0), ("bank", 20.0, 0.3)  # under a rule
 METHODS = {
     "exact price": tuple((drift, 20.0, 0.1) for drift in (0.1, 0.3, 1.0)),
     "exact price, load bank": (("bank", 0.0, 0.3), ("bank", 20.0, 0.3), ("bank", 20.0, 0.1)),
@@ -79,6 +90,12 @@ METHODS = {
     "rounding, hysteresis": DRIFTS,
     "event-triggered": DRIFTS,
     "l1 on moves": DRIFTS,
+    "elastic net on moves": DRIFTS,
+    "concave penalty on moves": tuple((0.3, 0.0, 1.0, name) for name in CONCAVE),
+    "l0 on inputs": DRIFTS,
+    "self-triggered": DRIFTS,
+    "dead-band, load bank": BANKS,
+    "rounding, hysteresis, load bank": BANKS,
 }
 LIMITS = ("non-anticipative", "clairvoyant")
 EVERYTHING = METHODS | dict.fromkeys(LIMITS, ())

@@ -368,3 +368,18 @@ def test_holds_are_decided_by_what_inputs_reach_whatever_the_estimator_and_the_s
         run = mampc.simulate(model, regulator, reference, noise=0.01, progress=False)
         assert 0 < np.count_nonzero(np.diff(run.u, axis=0)) <= 12  # two inputs, a few holds
         assert np.abs(run.y - run.r)[-10:].mean() < 0.25
+
+
+def test_the_norm_of_self_triggered_control_falls_by_its_rate_under_the_lq_law_whatever_the_dead_times():
+    """So some constant input keeps the decay for a sample, and holds are decided by outputs and not by modes."""
+    from mampc.rivals.self_triggered import _law_of
+
+    model = mampc.plants.ogunnaike_ray()
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=40, control_horizon=5, output_weight=[1e6, 1e6, 1e2], move_weight=[1e3, 1e4, 1.0],
+    )  # fmt: skip
+    law = _law_of(problem, None)
+    z = np.random.default_rng(0).normal(size=(len(law.A), 50))
+    for _ in range(30):
+        before, z = np.abs(law.P @ z).max(axis=0), (law.A - law.B @ law.K) @ z
+        assert (np.abs(law.P @ z).max(axis=0) <= law.rho * before * (1 + 1e-6)).all()

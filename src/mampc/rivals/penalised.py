@@ -123,7 +123,10 @@ class Penalised(Controller):
                 break
             d = solution.z[v : v + n]
             value = self._value(sample, d, z0, f_terminal, H_terminal)
-            settled = last - value <= self._tolerance * abs(value) and rounds > 2 * PATIENCE
+            still = (
+                2 * PATIENCE if np.isfinite(norm).any() else 1
+            )  # rounds in which a norm may begin to vanish
+            settled = last - value <= self._tolerance * abs(value) and rounds > still
             if not self.penalty.repeated or settled:
                 break
             last = value

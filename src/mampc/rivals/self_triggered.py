@@ -1,18 +1,19 @@
-"""Self-triggered minimum attention by linear programs (Donkers, Tabuada and Heemels 2011, 2014).
+"""Self-triggered minimum attention with linear constraints (Donkers, Tabuada and Heemels 2011, 2014).
 
-When the inputs move, they are chosen to be held as long as possible: h is the largest of 1..h_max for which some
-constant input keeps a control Lyapunov function below its decay at every sample of the hold,
+When the inputs move, they are chosen to be held as long as possible, and among those nearest to the LQ law's: h is the
+largest of 1..h_max for which some constant input keeps a control Lyapunov function below its decay at every sample of
+the hold,
 
-    |P (x_{k+i} - x_s)|_inf <= beta rho^i |P (x_k - x_s)|_inf,    i = 1..h
+    |P z_{k+i}|_inf <= beta rho^i |P z_k|_inf,    i = 1..h,    z = (x - x_s, u - u_s)
 
-and without beta at i = h, since else an input under which nothing decays might be held again and again; one linear
-program per h. P comes from the closed loop of the LQ law: the real eigenvectors of a stable matrix give an
-infinity norm that decays along it. Where not even h = 1 can be kept, one step of MPC is made.
+and without beta at i = h, since else an input under which nothing decays might be held again and again; one small
+program per h. P comes from the closed loop of the LQ law: its errors and inputs to come are an infinity norm that decays
+along it. Where not even h = 1 can be kept, one step of MPC is made.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,13 +23,19 @@ from mampc.base.words import Status
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
 from mampc.methods.method import Plan
+from mampc.program.daqp import DaqpSolver
 from mampc.program.problem import TrackingProblem
+from mampc.program.qp import UNBOUNDED, QuadraticProgram
 from mampc.program.sample import Sample
 from mampc.program.steady import SteadyTarget
+from mampc.program.tail import square_root
 from mampc.rivals.rules import Rule
 
 NEAR = 1e-6  # of the state's size in P at a unit input: nearer to the target there is nothing left to decay
 UNREACHED = 1e-8  # of what an input of its size does to the mode that it moves the most: nothing
+NEAREST = 1e-6  # weight of inputs beside that of moves
+FASTEST, SLOWEST = 0.9, 0.99  # decay by itself
+MOST_AHEAD = 300  # samples of the LQ law
 LASTS = 1e-3  # share that a mode keeps from sample to sample; faster ones are dead times or as good as gone
 
 
@@ -39,7 +46,7 @@ class SelfTriggered(Rule):
         controller: what moves where the decay cannot be kept; its problem's weights give the LQ law.
         longest: h_max >= 1, samples.
         overshoot: beta >= 1, by how much the bound may start above the function.
-        decay: rho below 1 per sample; None for the slowest that the LQ law keeps, and 0.99 at most.
+        decay: rho below 1 per sample, slower than the LQ law decays; default half way from that to 1, 0.9 to 0.99.
 
     Raises:
         MampcError: a model that cannot be stabilised.
@@ -51,19 +58,16 @@ class SelfTriggered(Rule):
         super().__init__(controller)
         self._longest = as_whole("longest", longest, 1, 1000)
         self._beta = as_number("overshoot", overshoot, 1.0)
-        problem, model = self.problem, self.problem.model
-        m = model.n_inputs
-        self._P, slowest = _lyapunov_norm(problem)
-        own = min(max(0.5 * (1 + slowest), 0.9), 0.99)
-        self._rho = own if decay is None else as_number("decay", decay, 0.0, exclusive=True)
-        if self._rho >= 1:
+        if decay is not None and not as_number("decay", decay, 0.0, exclusive=True) < 1:
             raise MampcError(f"decay: expected below 1, received {decay}")
-        self._target = SteadyTarget(problem, self.condensed.parameter)
-        powers, sums = [np.eye(model.n_states)], [np.zeros((model.n_states, m))]
-        for _ in range(self._longest):
-            sums.append(model.A @ sums[-1] + model.B[:, :m])
-            powers.append(model.A @ powers[-1])
-        self._free, self._forced = self._P @ np.array(powers[1:]), self._P @ np.array(sums[1:])
+        self._law = law = _law_of(self.problem, decay)
+        self._target = SteadyTarget(self.problem, self.condensed.parameter)
+        powers, moved = [law.A], [law.B]
+        for _ in range(1, self._longest):
+            powers.append(law.A @ powers[-1])
+            moved.append(law.A @ moved[-1])
+        self._solvers: dict[int, DaqpSolver] = {}  # by the samples of a hold
+        self._free, self._forced = law.P @ np.array(powers), law.P @ np.array(moved)
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
         """The hold that was decided, as long as it lasts and the target stays; else the longest one anew."""
@@ -74,109 +78,114 @@ class SelfTriggered(Rule):
         if memory is not None and memory[0] > 0 and np.array_equal(memory[1:], reference):
             plan = self._only(np.zeros(m), Plan(None, Status.FEASIBLE, 0))
             return plan._replace(memory=np.concatenate([[memory[0] - 1], memory[1:]]))
-        error = p[self.condensed.parameter.x] - steady.x
-        held, chosen = self._longest_hold(error, u - steady.u, steady.u)
-        if chosen is None or sample.frozen is not None:
+        error = np.concatenate([p[self.condensed.parameter.x] - steady.x, (u - steady.u) / self._law.unit])
+        held, move = self._longest_hold(error, u)
+        if move is None or sample.frozen is not None:
             plan = self.controller.plan(sample, state)
             if plan.moves is None:
                 return plan
             plan = self._only(plan.moves[:m], plan)
         else:
-            plan = self._only(steady.u + chosen - u, Plan(None, Status.FEASIBLE, held))
+            plan = self._only(self._law.unit * move, Plan(None, Status.FEASIBLE, held))
         return plan._replace(memory=np.concatenate([[max(held, 1) - 1], reference]))
 
-    def _longest_hold(self, error: Array, now: Array, u_s: Array) -> tuple[int, Array | None]:
-        """h, and the input less its target that keeps the decay for so long: the applied one if it does."""
-        size = float(np.abs(self._P @ error).max())
+    def _longest_hold(self, error: Array, u: Array) -> tuple[int, Array | None]:
+        """h, and the move (m,), in units, that keeps the decay for so long: none if the applied inputs u do."""
+        size, none = float(np.abs(self._law.P @ error).max()), np.zeros(len(u))
         reach = np.abs(self._forced).max()
         if size <= NEAR * max(reach, 1e-300):
-            return self._longest, now
-        end = size * self._rho ** np.arange(1, self._longest + 1)
+            return self._longest, none
+        end = size * self._law.rho ** np.arange(1, self._longest + 1)
         level, drift = self._beta * end, self._free @ error
-
-        def kept(v: Array) -> int:
-            largest = np.abs(drift + self._forced @ v).max(axis=1)
-            beyond = np.flatnonzero(largest > level)
-            within = beyond[0] if len(beyond) else len(level)
-            holds = np.flatnonzero(largest[:within] <= end[:within])
-            return int(holds[-1]) + 1 if len(holds) else 0
-
-        best, chosen = kept(now), now
-        if best == self._longest:
-            return best, chosen
-        low, high = max(best, 0), self._longest
-        found: Array | None = chosen if best else None
+        largest = np.abs(drift).max(axis=1)
+        beyond = np.flatnonzero(largest > level)
+        within = beyond[0] if len(beyond) else len(level)
+        holds = np.flatnonzero(largest[:within] <= end[:within])
+        low, high = (int(holds[-1]) + 1 if len(holds) else 0), self._longest
+        found: Array | None = none if low else None
         while low < high:
             middle = (low + high + 1) // 2
-            v = self._program(drift[:middle], np.append(level[: middle - 1], end[middle - 1]), u_s)
-            if v is None:
+            move = self._program(error, drift[:middle], np.append(level[: middle - 1], end[middle - 1]), u)
+            if move is None:
                 high = middle - 1
             else:
-                low, found = middle, v
+                low, found = middle, move
         return low, found
 
-    def _program(self, drift: Array, level: Array, u_s: Array) -> Array | None:
-        """An input less its target that keeps |drift + forced v| <= level, the smallest; None if there is none."""
-        from scipy.optimize import linprog
-
-        h, n, m = len(level), self._forced.shape[1], self._forced.shape[2]
-        rows = self._forced[:h].reshape(h * n, m)
-        scale = np.repeat(level, n)
-        limits = self.problem.limits
-        low, high = limits.u_min - u_s, limits.u_max - u_s
-        A = np.vstack([rows, -rows]) / np.tile(scale, 2)[:, None]
-        b = np.concatenate([1 - drift.ravel() / scale, 1 + drift.ravel() / scale])
-        # With t: the largest share of its level that anything takes.
-        A = np.hstack([A, -np.ones((len(A), 1))])
-        solution: Any = linprog(
-            np.concatenate([np.zeros(m), [1.0]]), A_ub=A, b_ub=b - 1,
-            bounds=[*zip(low, high, strict=True), (None, None)], method="highs",
-        )  # fmt: skip
-        if solution.status != 0 or solution.x[-1] > 1.0:
-            return None
-        return np.asarray(solution.x[:m])
+    def _program(self, error: Array, drift: Array, level: Array, u: Array) -> Array | None:
+        """The move, nearest to that of the LQ law, that keeps |drift + forced move| <= level, in units; or None."""
+        h, unit, limits, size = len(level), self._law.unit, self.problem.limits, level[0]
+        if h not in self._solvers:
+            rows = self._forced[:h].reshape(-1, len(u))
+            self._solvers[h] = DaqpSolver(QuadraticProgram(np.eye(len(u)), rows, len(u)))
+        free, most = drift.ravel(), np.repeat(level, drift.shape[1])
+        low = np.concatenate([(limits.u_min - u) / unit, -most - free]) / size
+        high = np.concatenate([(limits.u_max - u) / unit, most - free]) / size
+        solver = self._solvers[h]
+        solver.start()
+        solution = solver.solve(
+            self._law.K @ error / size, np.maximum(low, -UNBOUNDED), np.minimum(high, UNBOUNDED)
+        )
+        return None if solution.z is None else size * solution.z
 
 
-def _lyapunov_norm(problem: TrackingProblem) -> tuple[Array, float]:
-    """P of an infinity norm |P x| that decays along the LQ law's closed loop, and its rate.
+class _Law(NamedTuple):
+    """Moves -K z, in units, of the state z = (x - x_s, (u - u_s) / unit), z+ = A z + B move; |P z|_inf falls by rho."""
 
-    One row a mode that inputs reach; what is left of the modes, such as a load that fades, no input decides. Rows are
-    in units of the LQ cost that a mode alone would have, the same whatever the units of states and signals.
+    A: Array
+    B: Array
+    K: Array
+    P: Array
+    rho: float
+    unit: Array
+
+
+def _law_of(problem: TrackingProblem, decay: float | None) -> _Law:
+    """The LQ law with a problem's weights, and a norm of what errors and moves are to come under it.
+
+    Rows of P are rho^-i H (A - B K)^i, with H of weighted outputs and moves, until further ones are combinations of these
+    with weights of 1 together. So the norm falls by rho a sample under the law, and counts in units of the cost whatever
+    the states' units are. Modes that inputs do not reach, such as a load that fades, count for nothing: no input
+    decides them.
     """
     from scipy.linalg import solve_discrete_are
 
-    model = problem.model
-    A, B = model.A, model.B[:, : model.n_inputs]
-    Q = model.C.T @ problem.output_weight @ model.C
-    Q = Q + 1e-6 * max(np.trace(Q), 1e-300) / len(Q) * np.eye(len(Q))
+    model, weights = problem.model, np.diag(problem.move_weight)
+    n, m = model.n_states, model.n_inputs
+    unit = 1 / np.sqrt(np.where(weights > 0, weights, 1.0))
+    A = np.block([[model.A, model.B[:, :m] * unit], [np.zeros((m, n)), np.eye(m)]])
+    B = np.vstack([model.B[:, :m] * unit, np.eye(m)])
+    output = square_root(problem.output_weight) @ np.hstack([model.C, model.D[:, :m] * unit])
+    R = unit[:, None] * problem.move_weight * unit
+    Q = output.T @ output
+    Q[n:, n:] += NEAREST * np.eye(m)  # where outputs leave inputs free, these return to their target
     try:
-        S = solve_discrete_are(A, B, Q, problem.move_weight)
+        S = solve_discrete_are(A, B, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise MampcError(
             f"SelfTriggered: expected a model that an LQ law stabilises, received one with: {error}"
         ) from None
-    closed = A - B @ np.linalg.solve(problem.move_weight + B.T @ S @ B, B.T @ S @ A)
+    K = np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A)
+    closed = A - B @ K
     values, vectors = np.linalg.eig(closed)
-    unit = 1 / np.sqrt(np.diag(B.T @ S @ B) + np.diag(problem.move_weight))
-    left = _unreached(A, B * unit)
-    reached = np.abs(left @ vectors).max(axis=0, initial=0.0) <= UNREACHED * np.abs(left).max(initial=0.0)
-    slowest = float(np.abs(values[reached]).max(initial=0.0))
-    # Complex pairs as their real and imaginary parts: their norm decays by |Re| + |Im| a sample.
-    columns = [
-        vectors[:, i].real if value.imag >= 0 else vectors[:, i].imag for i, value in enumerate(values)
-    ]
-    V = np.array(columns).T
-    if np.linalg.cond(V) <= 1e10:
-        cost = np.sqrt(np.maximum(np.einsum("in,ij,jn->n", vectors.conj(), S, vectors).real, 0.0))
-        return (cost[:, None] * np.linalg.inv(V))[reached], slowest
-    # A defective closed loop: the square root of its Lyapunov function instead.
-    from mampc.program.tail import square_root
-
+    left = _unreached(A, B / np.sqrt(np.diag(B.T @ S @ B) + np.diag(R)))
+    size = np.abs(left).max(initial=0.0)
+    reached = np.abs(left @ vectors).max(axis=0, initial=0.0) <= UNREACHED * size
     own = vectors[:, ~reached]
     if len(left) != own.shape[1]:
         raise MampcError("SelfTriggered: expected a model whose inputs reach all of its lasting modes")
-    P = square_root(S) @ (np.eye(len(A)) - (own @ np.linalg.solve(left @ own, left)).real)
-    return P, slowest
+    only = np.eye(len(A)) - (own @ np.linalg.solve(left @ own, left)).real if len(left) else np.eye(len(A))
+    slowest = float(np.abs(values[reached]).max(initial=0.0))
+    rho = min(max(0.5 * (1 + slowest), FASTEST), SLOWEST) if decay is None else decay
+    rows = ahead = np.vstack([output, square_root(R) @ K]) @ only
+    for _ in range(MOST_AHEAD):
+        ahead = ahead @ closed / rho
+        parts = ahead @ np.linalg.pinv(rows)
+        left_out = np.abs(ahead - parts @ rows).max()
+        if np.abs(parts).sum(axis=1).max() <= 1 and left_out <= UNREACHED * np.abs(rows).max():
+            break
+        rows = np.vstack([rows, ahead])
+    return _Law(A, B, K, rows, rho, unit)
 
 
 def _unreached(A: Array, B: Array) -> Array:
