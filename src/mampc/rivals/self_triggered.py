@@ -7,13 +7,13 @@ the hold,
     |P z_{k+i}|_inf <= beta rho^i |P z_k|_inf,    i = 1..h,    z = (x - x_s, u - u_s)
 
 and without beta at i = h, since else an input under which nothing decays might be held again and again; one small
-program per h. P comes from the closed loop of the LQ law: its errors and inputs to come are an infinity norm that decays
-along it. Where not even h = 1 can be kept, one step of MPC is made.
+program per h. P comes from the closed loop of the LQ law: its errors and moves to come are an infinity norm that
+decays along it. Where not even h = 1 can be kept, one step of MPC is made.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -143,10 +143,10 @@ class _Law(NamedTuple):
 def _law_of(problem: TrackingProblem, decay: float | None) -> _Law:
     """The LQ law with a problem's weights, and a norm of what errors and moves are to come under it.
 
-    Rows of P are rho^-i H (A - B K)^i, with H of weighted outputs and moves, until further ones are combinations of these
-    with weights of 1 together. So the norm falls by rho a sample under the law, and counts in units of the cost whatever
-    the states' units are. Modes that inputs do not reach, such as a load that fades, count for nothing: no input
-    decides them.
+    Rows of P are rho^-i H (A - B K)^i, with H of weighted outputs and moves, until further ones are combinations of
+    these with weights of 1 together. So the norm falls by rho a sample under the law, and counts in units of the cost
+    whatever the states' units are. Modes that inputs do not reach, such as a load that fades, count for nothing: no
+    input decides them.
     """
     from scipy.linalg import solve_discrete_are
 
