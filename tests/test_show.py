@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 import mampc
 from mampc import StateSpace
 from mampc.cli import app
+from mampc.report.showing import model_words
 from mampc.systems.evidence import Evidence
 from mampc.systems.noise import Noise
 from mampc.systems.properties import properties
@@ -75,8 +76,10 @@ def test_dead_times_alone_are_no_zeros(column):
 
 
 def test_what_grows_is_told():
-    found = properties(StateSpace([[1.1, 0.0], [0.0, 0.5]], [[1.0], [1.0]], np.eye(2), None, 1.0))
+    model = StateSpace([[1.1, 0.0], [0.0, 0.5]], [[1.0], [1.0]], np.eye(2), None, 1.0)
+    found = properties(model)
     assert found.unstable == 1
+    assert not any("settles" in sentence for sentence in model_words(model))
     assert np.isinf(found.gain[0, 0])
     np.testing.assert_allclose(found.gain[1, 0], 2.0)
     assert found.relative_gain is None

@@ -58,9 +58,8 @@ def model_tables(model: StateSpace) -> list[Any]:
 def model_words(model: StateSpace) -> list[str]:
     """Everything that is no property of one channel, a sentence each."""
     found = properties(model)
-    sentences = [
-        f"sampled every {time_in_words(model.dt)}; settles within {time_in_words(found.settling_time)}"
-    ]
+    settles = "" if found.unstable else f"; settles within {time_in_words(found.settling_time)}"
+    sentences = [f"sampled every {time_in_words(model.dt)}{settles}"]
     if found.integrators:
         sentences.append(f"{found.integrators} of its poles integrate: they are at one")
     if found.unstable:
