@@ -12,6 +12,7 @@ import mampc
 from builders import cost_of, predicted, random_model, sample_data
 from mampc import Status
 from mampc.methods.exact import ranking
+from mampc.methods.exact.open_patterns import OpenPatterns
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import PatternSolver
 from mampc.program.condensing import CondensedQP
@@ -360,3 +361,30 @@ def test_a_search_over_signs_that_is_cut_short_says_so_and_offers_what_it_found(
             assert (np.abs(cut.moves) >= 0.3).all()
     assert statuses == {QPStatus.TIME_LIMIT, QPStatus.OPTIMAL}
     assert cut.objective == pytest.approx(whole.objective, rel=1e-12)
+
+
+def test_every_pattern_takes_the_best_multipliers_between_new_and_earlier_ones():
+    rng = np.random.default_rng(5)
+    model = random_model(5, n=3, m=2, l=2)
+    limits = mampc.Limits(u_min=model.u_op - 0.3, u_max=model.u_op + 0.3)
+    problem = mampc.TrackingProblem(model, prediction_horizon=8, control_horizon=4, limits=limits)
+    condensed = CondensedQP(problem)
+    admissible = AdmissiblePatterns(mampc.MoveRules(max_moves=3), 2, 4)
+    table = ranking.ranking_of(condensed, admissible)
+    x, reference = rng.standard_normal(3), model.y_op + 5 * rng.standard_normal(2)
+    sample = sample_data(condensed, model.u_op, x=x, reference=reference)
+    past = admissible.allowance(model.u_op[None])
+    solver = PatternSolver(condensed, admissible)
+    patterns = table.patterns[table.rows(past)]
+    optima = [solver.solve(sample, pattern) for pattern in patterns]
+    shown = [optima[i].multipliers for i in (0, 3, 7)]
+    without = table.bounds(sample.moves, sample.cost, past)
+    open_ = OpenPatterns(table, sample, past, without, condensed.priced(sample, shown[0]))
+    for multipliers in shown[1:]:
+        open_.price(condensed.priced(sample, multipliers), np.inf)
+    ends = [(new, shown[j]) for i, new in enumerate(shown) for j in range(i + 1)]
+    between = [new + s * (old - new) for new, old in ends for s in np.linspace(0, 1, 501)]
+    best = np.max([without, *(table.priced(condensed.priced(sample, m), past) for m in between)], axis=0)
+    np.testing.assert_allclose(open_.bounds, best, rtol=1e-3)  # of a grid
+    assert (open_.bounds <= [one.objective * (1 + 1e-9) for one in optima]).all()
+    assert (open_.bounds > without + 0.1 * best).any()

@@ -16,6 +16,7 @@ from mampc.moves.level_search import Completion, Found, LevelSearch, Past
 from mampc.moves.rounding import without_rounding
 from mampc.moves.signs import search_signs
 from mampc.program.condensing import CondensedQP
+from mampc.program.least_distance import Nearest
 from mampc.program.levels import InputLevels
 from mampc.program.qp import QPStatus
 from mampc.program.restriction import Restriction
@@ -187,26 +188,30 @@ class PatternSolver:
         if bounds is None:
             return OnPattern(None, np.inf, QPStatus.INFEASIBLE, None, 0)
         restriction = self._restriction(pattern)
+        base = sample.cost + self.admissible.charge(pattern) + sample.charge(pattern)
+        sized = self.admissible.sized and within is None and bool(pattern.any())
+        if within is None and self._levels is None and not sized:
+            both = sample.both_bounds if sample.bounds_now is None else np.concatenate(bounds)
+            nearest = restriction.nearest(sample.target, both, cutoff - base)
+            if nearest.moves is None:
+                excess = restriction.excess(sample.target) if _failed(nearest) else nearest.excess
+                return OnPattern(None, base + excess, nearest.status, nearest.multipliers, nearest.iterations)
+            return self._answer(sample, pattern, nearest, base + nearest.excess, cutoff)
         optimum = restriction.optimum(sample.target)
-        base = sample.cost + restriction.excess(sample.target)
-        base += self.admissible.charge(pattern) + sample.charge(pattern)
-        sizes = self.admissible.min_size[pattern] if self.admissible.sized and pattern.any() else None
+        base += restriction.excess(sample.target)
         lower, upper = kept = bounds[0][restriction.bounds], bounds[1][restriction.bounds]
         if within is not None:
-            sizes, own = None, slice(restriction.n_violations, restriction.n_violations + len(within[0]))
+            own = slice(restriction.n_violations, restriction.n_violations + len(within[0]))
             lower[own], upper[own] = np.maximum(lower[own], within[0]), np.minimum(upper[own], within[1])
         nearest = restriction.solve(optimum, lower, upper)
         if nearest.moves is None or base + nearest.excess >= cutoff:
-            failed = nearest.moves is None and nearest.status not in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA)
-            bound = base if failed else base + nearest.excess
+            bound = base if _failed(nearest) else base + nearest.excess
             return OnPattern(None, bound, nearest.status, nearest.multipliers, nearest.iterations)
         if self._levels is not None:
             return self._on_levels(sample, pattern, optimum, bounds, nearest.multipliers, cutoff, deadline)
-        if sizes is None or (nearest.moves is optimum and (np.abs(optimum) >= sizes).all()):
-            return self._answer(
-                sample, pattern, nearest.moves, base + nearest.excess, cutoff, nearest.multipliers,
-                nearest.iterations,
-            )  # fmt: skip
+        sizes = self.admissible.min_size[pattern]
+        if not sized or (nearest.moves is optimum and (np.abs(optimum) >= sizes).all()):
+            return self._answer(sample, pattern, nearest, base + nearest.excess, cutoff)
         signed = search_signs(
             restriction, nearest, optimum, kept, sizes, SMALLER * self.condensed.move_prefix[pattern],
             cutoff=cutoff - base, most=self._most_programs, deadline=deadline,
@@ -214,15 +219,8 @@ class PatternSolver:
         if signed.moves is None:
             excess = max(signed.excess, nearest.excess)  # that without least sizes where a program failed
             return OnPattern(None, base + excess, signed.status, nearest.multipliers, signed.iterations)
-        answer = self._answer(
-            sample,
-            pattern,
-            signed.moves,
-            base + signed.excess,
-            np.inf,
-            nearest.multipliers,
-            signed.iterations,
-        )
+        of_signs = nearest._replace(moves=signed.moves, iterations=signed.iterations)
+        answer = self._answer(sample, pattern, of_signs, base + signed.excess, np.inf)
         return answer._replace(status=signed.status)
 
     def _on_levels(
@@ -257,17 +255,11 @@ class PatternSolver:
         return sample.bounds_now.on(pattern)
 
     def _answer(
-        self,
-        sample: Sample,
-        pattern: BoolArray,
-        chosen: Array,
-        objective: float,
-        cutoff: float,
-        multipliers: Array | None,
-        iterations: int,
+        self, sample: Sample, pattern: BoolArray, nearest: Nearest, objective: float, cutoff: float
     ) -> OnPattern:
         """Moves of the pattern, shape (its moves,), as an answer; those that are none after all cost nothing."""
-        if objective >= cutoff:
+        chosen, multipliers, iterations = nearest.moves, nearest.multipliers, nearest.iterations
+        if chosen is None or objective >= cutoff:
             return OnPattern(None, objective, QPStatus.OPTIMAL, multipliers, iterations)
         moves: Array = np.zeros(self.condensed.n_moves)
         moves[pattern] = chosen
@@ -306,3 +298,8 @@ class PatternSolver:
         else:
             self._kept.move_to_end(key)
         return entry
+
+
+def _failed(nearest: Nearest) -> bool:
+    """Whether a program has no answer though there may be one."""
+    return nearest.status not in (QPStatus.OPTIMAL, QPStatus.INFEASIBLE, QPStatus.BAD_DATA)

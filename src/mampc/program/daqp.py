@@ -114,6 +114,28 @@ class DaqpSolver:
             solution = self._solution(z, info)
             if square <= ORDINARY**2 or self._is_optimal(solution, f, lower, upper):
                 return solution
+        return self._failed(flag, info, f, lower, upper)
+
+    def solve_anew(self, f: Array, lower: Array, upper: Array, active: Array | None = None) -> QPSolution:
+        """`start` and `solve`, for contiguous arrays of the right shape that are nobody else's.
+
+        f is no longer than ORDINARY.
+        """
+        model, apart = getattr(self._local, "model", None), lower <= upper
+        if model is None or self._units is not None or not apart[apart.argmin()]:
+            self.start(active)
+            return self.solve(f, lower, upper)
+        sense = self._inactive if active is None else _there(active, lower, upper)
+        if model.update(f=f, blower=lower, bupper=upper, sense=sense) < 0:
+            self._local.model = None
+            return _BAD_DATA
+        z, _, flag, info = model.solve()
+        if flag > 0:
+            return QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
+        return self._failed(flag, info, f, lower, upper)
+
+    def _failed(self, flag: int, info: dict[str, Any], f: Array, lower: Array, upper: Array) -> QPSolution:
+        """What is left to say of a program without an optimum that counts."""
         self._local.model = None
         status = QPStatus.FAILED if flag > 0 else _STATUS.get(flag, QPStatus.FAILED)
         scale = self._scale(f)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.program.daqp import DaqpSolver
+from mampc.program.daqp import ORDINARY, DaqpSolver
 from mampc.program.qp import QPSolution, QPStatus, QuadraticProgram
 from mampc.program.refinement import refined
 
@@ -30,7 +30,7 @@ class Nearest(NamedTuple):
     """The best moves within limits, shape (moves,), what they cost more than the optimum without, and multipliers.
 
     Multipliers, shape (bounds,), are positive at upper bounds. Moves and multipliers are None, and the excess is
-    infinite, unless the status is OPTIMAL.
+    infinite, unless the status is OPTIMAL. Moves are None too where they cost more than is asked for.
     """
 
     moves: Array | None
@@ -57,6 +57,10 @@ class LeastDistance:
     """One such program, to be solved again and again for new optima and bounds.
 
     Every solve begins anew, from the active bounds given, so that its answer depends on its arguments alone.
+
+    Attributes:
+        even: factors of the bounds that make their rows about as long as each other, shape (v + b,).
+        even_rows: rows times theirs, shape (b, k).
 
     Args:
         R: upper triangular factor of the cost in the moves, shape (k, k).
@@ -87,9 +91,12 @@ class LeastDistance:
         length = np.sqrt(np.square(A).sum(axis=1))
         # Powers of two change no digit.
         even = 2.0 ** -np.round(np.log2(np.where(length > 0, length, 1.0)))
-        self._A, self._even_rows = A * even[:, None], rows * even[:, None]
-        self._even = np.concatenate([1 / self._per_violation, even])
+        self._A, self.even_rows = A * even[:, None], rows * even[:, None]
+        self.even = np.concatenate([1 / self._per_violation, even])
         self._f = np.concatenate([cost.linear * self._per_violation, np.zeros(k)])
+        self._ordinary = bool(self._f.dot(self._f) <= ORDINARY**2)
+        self._nothing = np.zeros(v + len(A))
+        self._nothing.setflags(write=False)
         self._solver = DaqpSolver(
             QuadraticProgram(2 * np.eye(v + k), self._A, v),
             time_limit=time_limit,
@@ -100,17 +107,33 @@ class LeastDistance:
     def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
         """The best moves, given the optimum without limits, shape (k,), and all bounds, shape (v + b,)."""
         low, high = self.distances(optimum, lower, upper)
+        return self.solve_at(optimum, low, high, lower, upper, active)
+
+    def solve_at(
+        self,
+        optimum: Array,
+        low: Array,
+        high: Array,
+        lower: Array,
+        upper: Array,
+        active: Array | None = None,
+        cutoff: float = np.inf,
+    ) -> Nearest:
+        """The same where `distances` low and high are at hand; moves that cost no less than the cutoff are left out."""
         far = self._far(low, high)
         if far <= 0:
-            return Nearest(optimum, 0.0, np.zeros(len(low)), QPStatus.OPTIMAL, 0)
+            return Nearest(optimum, 0.0, self._nothing, QPStatus.OPTIMAL, 0)
         f, v, scale = self._f, self._v, 1.0
         limited = self._limited
         # Violations of limits have a size of their own, 1: nothing smaller is enlarged then.
         if far > (1.0 if limited else 0.0) and isfinite(far):
             scale = float(2.0 ** frexp(far)[1])
             f, low, high = f / scale, low / scale, high / scale
-        self._solver.start(active)
-        solution = self._solver.solve(f, low, high)
+        if self._ordinary:
+            solution = self._solver.solve_anew(f, low, high, active)
+        else:
+            self._solver.start(active)
+            solution = self._solver.solve(f, low, high)
         z, pull, status, iterations = solution
         if z is None or pull is None:
             if status in (QPStatus.INFEASIBLE, QPStatus.FAILED, QPStatus.ITERATION_LIMIT):
@@ -120,11 +143,13 @@ class LeastDistance:
         excess, violated = float(delta.dot(delta)), limited > 0 and max(z[:limited].tolist()) > 0
         if violated or v > limited:
             excess += self._cost.of(z[:v] * (scale * self._per_violation))
-        multipliers = pull * (scale * self._even)
+        multipliers = pull * (scale * self.even)
         if self._doubtful:
             slack = np.where(pull > 0, high, low)[v:] - self._A.dot(z)
             if scale * scale * np.abs(pull[v:]).dot(np.abs(slack)) > UNCERTAIN * excess:
                 return self._refined(optimum, lower, upper, multipliers, iterations)
+        if excess >= cutoff:
+            return Nearest(None, excess, multipliers, status, iterations, violated)
         moves = self._inverse.dot(delta)
         moves += optimum
         for i, force in enumerate(pull[v : v + self._n_simple].tolist()):
@@ -181,7 +206,7 @@ class LeastDistance:
 
         `distances` of the bounds, as `distances` gives them.
         """
-        pull, v, (low, high) = multipliers / self._even, self._v, distances
+        pull, v, (low, high) = multipliers / self.even, self._v, distances
         gradient = pull[v:].dot(self._A)
         gradient += self._f
         gradient[:v] += pull[:v]
@@ -190,7 +215,7 @@ class LeastDistance:
 
     def distances(self, optimum: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
         """The bounds as distances from the optimum."""
-        low, high, reached = lower * self._even, upper * self._even, self._even_rows.dot(optimum)
+        low, high, reached = lower * self.even, upper * self.even, self.even_rows.dot(optimum)
         low[self._v :] -= reached
         high[self._v :] -= reached
         return low, high

@@ -86,15 +86,49 @@ class Restriction:
         Returns:
             As `LeastDistance`, multipliers being those of all bounds, shape (n_bounds,).
         """
-        if len(self.bounds) == self._n_bounds:
-            return self.program.solve(optimum, lower, upper, active)
-        nearest = self.program.solve(optimum, lower, upper, None if active is None else active[self.bounds])
-        if nearest.multipliers is None:
-            return nearest
+        if active is not None:
+            active = active[self.bounds]
+        return self._of_all_bounds(self.program.solve(optimum, lower, upper, active))
+
+    def nearest(self, target: Array, bounds: Array, cutoff: float = np.inf) -> Nearest:
+        """The best moves within limits, if they cost less than the cutoff, with what they cost more than all moves do.
+
+        Args:
+            target: of the sample.
+            bounds: all lower bounds, and behind them all upper ones, shape (2 n_bounds,).
+        """
+        k, kept = len(self.moves), len(self.bounds)
+        of_target, which, even = self._of_sample
+        values, given = of_target.dot(target), bounds.take(which)
+        missed, distances = values[k : len(target)], given * even
+        distances -= values[len(target) :]
+        excess = float(missed.dot(missed))
+        nearest = self.program.solve_at(
+            values[:k], distances[:kept], distances[kept:], given[:kept], given[kept:], cutoff=cutoff - excess
+        )
+        return self._of_all_bounds(nearest, excess)
+
+    @cached_property
+    def _of_sample(self) -> tuple[Array, Indices, Array]:
+        """What `nearest` needs: optimum, missed and twice the even rows per target; which bounds; their factors."""
+        even = self.program.even
+        rows = np.vstack(
+            [np.zeros((self.n_violations, len(self.missed.T))), self.program.even_rows @ self._optimum]
+        )
+        return (
+            np.vstack([self._optimum, self.missed, rows, rows]),
+            np.concatenate([self.bounds, self._n_bounds + self.bounds]),
+            np.concatenate([even, even]),
+        )
+
+    def _of_all_bounds(self, nearest: Nearest, excess: float = 0.0) -> Nearest:
+        """The answer with multipliers of all bounds, and the excess counted from elsewhere."""
+        moves, own, pulls, status, iterations, violated = nearest
+        if pulls is None or len(pulls) == self._n_bounds:
+            return nearest._replace(excess=own + excess) if excess else nearest
         multipliers = np.zeros(self._n_bounds)
-        multipliers[self.bounds] = nearest.multipliers
-        moves, excess, _, status, iterations, violated = nearest
-        return Nearest(moves, excess, multipliers, status, iterations, violated)
+        multipliers[self.bounds] = pulls
+        return Nearest(moves, own + excess, multipliers, status, iterations, violated)
 
 
 def by_count(patterns: BoolArray) -> Iterator[tuple[Indices, Indices]]:

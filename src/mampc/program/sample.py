@@ -154,6 +154,11 @@ class Sample(Optimum):
         """Upper bounds of the program, shape (n_bounds,)."""
         return self.data[self.parts.upper]
 
+    @property
+    def both_bounds(self) -> Array:
+        """Lower bounds, and behind them the upper ones."""
+        return self.data[self.parts.lower.start : self.parts.upper.stop]
+
 
 class BoundsNow:
     """The bounds of one sample, where inputs have limits that vary over the horizon.

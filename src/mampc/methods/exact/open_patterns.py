@@ -2,12 +2,12 @@
 
 The bound of a pattern is concave in the multipliers, and the best ones differ from pattern to pattern. Those that turn
 up belong to single patterns; for another one, multipliers somewhere between two of them are often better than both.
-So new ones are taken up together with points on the way to all earlier ones. With x the free optimum where limits are
-priced in, and D what the target has moved by, both affine in the multipliers, the bound is
+With x the free optimum where limits are priced in, and D what the target has moved by, both affine in the multipliers,
+the bound is
 
     level + x' T x - |D|^2 + price of the pattern        T: its row of the table
 
-and all points are one product of matrices.
+a quadratic on the way from new multipliers to earlier ones, whose largest value each pattern takes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mampc.methods.exact.ranking import Ranking
 from mampc.moves.admissible import Allowance
 from mampc.program.sample import Indices, LeastSquares, Sample
 
-SHARES = (1 / 3, 2 / 3)  # of the way from new multipliers to earlier ones
+FLAT = 1e-300  # of a curvature: what stands for none
 
 
 class OpenPatterns:
@@ -42,11 +42,15 @@ class OpenPatterns:
         self._ranking, self._sample = ranking, sample
         if first is not None:
             bounds = np.maximum(bounds, ranking.priced(first, past, sample.later_data))
-        self.rows, self.bounds = np.arange(len(bounds)) + ranking.rows(past).start, bounds
-        self._points: Array = self._point(sample.least_squares if first is None else first)[None]
-        self._table: Array | None = (
-            None  # of the rows, and what patterns cost beside: needed from the second point on
-        )
+        of_table = ranking.rows(past)
+        self.rows, self.bounds = np.arange(of_table.start, of_table.start + len(bounds)), bounds
+        self._first: LeastSquares | None = sample.least_squares if first is None else first
+        n = ranking.condensed.n_moves
+        # Per multipliers so far: x, D, level; and per pattern their x' T x - |D|^2.
+        self._x, self._shift, self._level = np.empty((0, n)), np.empty((0, n)), np.empty(0)
+        self._square = np.empty((0, len(bounds)))
+        self._table, self._charge = ranking.squares[of_table], ranking.charges(of_table, sample.later_data)
+        self._rounding = 0.0
 
     def best(self) -> tuple[int, float]:
         """The position of the pattern with the least bound, and that: infinite when none is left."""
@@ -67,24 +71,50 @@ class OpenPatterns:
 
     def price(self, cost: LeastSquares, cutoff: float) -> None:
         """Bound with other multipliers as well; patterns that cannot cost less than the cutoff are left out."""
-        open_, ranking, n = self.bounds < cutoff, self._ranking, len(self._sample.target)
-        if self._table is None or 2 * np.count_nonzero(open_) < len(open_):
-            self.rows, self.bounds = self.rows[open_], self.bounds[open_]
-            self._table, self._charge = (
-                ranking.table[self.rows],
-                ranking.charges(self.rows, self._sample.later_data),
-            )
-        point = self._point(cost)
-        self._points = np.concatenate((self._points, point[None]))
-        between = np.concatenate([point + share * (self._points - point) for share in SHARES])
-        x, shift, level = between[:, :n], between[:, n:-1], between[:, -1]
-        values = self._table @ ranking.products(x).T
-        values += level - np.einsum("ji,ji->j", shift, shift) - ranking.rounding(x)
-        if ranking.admissible.sized:
-            values += ranking.lift(x, self.rows)
-        np.maximum(self.bounds, values.max(axis=1) + self._charge, out=self.bounds)
+        open_ = self.bounds < cutoff
+        if 2 * np.count_nonzero(open_) < len(open_):
+            self.rows, self.bounds, self._charge = self.rows[open_], self.bounds[open_], self._charge[open_]
+            self._table, self._square = self._table[open_], self._square[:, open_]
+        if self._first is not None:
+            first, self._first = self._first, None
+            self._take(first)
+        values = self._take(cost)
+        values += self._charge
+        if self._ranking.admissible.sized:
+            values += self._ranking.lift(self._x[-1:], self.rows)[:, 0]
+        np.maximum(self.bounds, values, out=self.bounds)
 
-    def _point(self, cost: LeastSquares) -> Array:
-        """x, D and the level of some multipliers, shape (2 n + 1,)."""
-        shift = cost.target - self._sample.target
-        return np.concatenate((self._ranking.scaled(cost), shift, (cost.least + float(shift.dot(shift)),)))
+    def _take(self, cost: LeastSquares) -> Array:
+        """Take up some multipliers; what patterns cost at least with them, and on the way to earlier ones."""
+        ranking, (K, n) = self._ranking, self._table.shape[:2]
+        x, shift = ranking.scaled(cost), cost.target - self._sample.target
+        moved = float(shift.dot(shift))
+        level = cost.least + moved
+        self._rounding = max(self._rounding, 2 * ranking.rounding(x))
+        of_x = self._table.reshape(K * n, n).dot(x).reshape(K, n)
+        square = of_x.dot(x)
+        square -= moved
+        values = square + (level - self._rounding)
+        if len(self._level):
+            # With s of the way: (1 - s)^2 square + 2 s (1 - s) across + s^2 (that of the earlier ones).
+            slope = self._x.dot(of_x.T)
+            slope -= self._shift.dot(shift)[:, None]
+            slope -= square
+            curvature = self._square - square
+            slope *= 2
+            curvature -= slope
+            slope += (self._level - level)[:, None]
+            with np.errstate(over="ignore"):
+                share = slope / np.minimum(curvature, -FLAT)
+            share *= -0.5
+            np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
+            curvature *= share
+            curvature += slope
+            curvature *= share
+            values += np.maximum(curvature.max(axis=0), 0.0)
+        self._x, self._shift = np.concatenate((self._x, x[None])), np.concatenate((self._shift, shift[None]))
+        self._level, self._square = (
+            np.append(self._level, level),
+            np.concatenate((self._square, square[None])),
+        )
+        return np.asarray(values)

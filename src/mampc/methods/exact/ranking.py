@@ -14,6 +14,7 @@ x_i = |U_i| d*_i, all patterns are ranked by one matrix-vector product.
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import cached_property
 
 import numpy as np
 
@@ -83,7 +84,7 @@ class Ranking:
         x = free * self.condensed.lengths
         rows = self.rows(past)
         values: Array = self.table[rows].dot(x.take(self._rows) * x.take(self._columns))
-        values += least - len(x) * ROUNDING * float(x.dot(x))  # as `rounding`
+        values += least - self.rounding(x)
         if self.admissible.priced:
             values += self.charge[rows]
         if later_data is not None:
@@ -98,22 +99,35 @@ class Ranking:
         """The same with the limits priced in."""
         return self.bounds(self.condensed.plain.optimum(cost.target), cost.least, past, later_data)
 
+    @cached_property
+    def squares(self) -> Array:
+        """The table as symmetric matrices, shape (K, n_moves, n_moves)."""
+        n = self.condensed.n_moves
+        squares, halves = (
+            np.empty((len(self.table), n, n)),
+            self.table * np.where(self._rows == self._columns, 1.0, 0.5),
+        )
+        squares[:, self._rows, self._columns] = squares[:, self._columns, self._rows] = halves
+        return squares
+
     def scaled(self, cost: LeastSquares) -> Array:
         """x of a cost, shape (n_moves,)."""
-        x: Array = self.condensed.plain.optimum(cost.target) * self.condensed.lengths
+        x: Array = self._to_x.dot(cost.target)
         return x
 
-    def products(self, x: Array) -> Array:
-        """What the table is multiplied by, shape (J, n_moves (n_moves + 1) / 2), for x of shape (J, n_moves)."""
-        products: Array = x.take(self._rows, axis=1) * x.take(self._columns, axis=1)
-        return products
+    @cached_property
+    def _to_x(self) -> Array:
+        """x per target."""
+        to_x: Array = self.condensed.lengths[:, None] * self.condensed.plain.optimum(
+            np.eye(self.condensed.n_moves)
+        )
+        return to_x
 
-    def rounding(self, x: Array) -> Array:
-        """All that rounding can add to these products, shape (J,): no entry of the table is larger than 1."""
-        added: Array = x.shape[1] * ROUNDING * np.einsum("ji,ji->j", x, x)
-        return added
+    def rounding(self, x: Array) -> float:
+        """All that rounding can add to x' T x: no entry of the table is larger than 1."""
+        return len(x) * ROUNDING * float(x.dot(x))
 
-    def charges(self, rows: Indices, later_data: LaterData | None) -> Array:
+    def charges(self, rows: Indices | slice, later_data: LaterData | None) -> Array:
         """What patterns cost beside, shape (rows,)."""
         return (
             self.charge[rows]
