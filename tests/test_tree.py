@@ -20,6 +20,7 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.condensing import CondensedQP
 from referees import all_patterns, best_on_every_pattern, charge
+from seeds import seeds
 
 
 @pytest.fixture(autouse=True)
@@ -175,7 +176,8 @@ def test_the_last_moves_of_nodes_cost_what_least_squares_say(seed):
     for level in range(4):
         nodes, _ = children_of(level, nodes, at)
     leaves, rest = finished(4, nodes, at.squares, at.terms)
-    more = with_one_more(4, nodes, rest, at.squares, at.terms)
+    limit = np.full((len(nodes.bound), len(at.order) - 4), np.inf)
+    more = with_one_more(4, nodes, rest, at.squares, at.terms, limit)
     U, target = at.squares.condensed.U, at.sample.target
     for row, chosen in enumerate(leaves.chosen):
         made = chosen[chosen >= 0]
@@ -273,7 +275,7 @@ def priced_case(seed, scale_u=1.0, scale_y=1.0, max_moves=None):
 
 
 def decide(problem, rules, x, reference):
-    controller = mampc.MAMPC(problem, rules)
+    controller = mampc.MAMPC(problem, rules, method=mampc.Exact(time_limit=60.0))  # on a busy machine
     return controller.step(controller.initial_state(), x, reference)
 
 
@@ -337,3 +339,38 @@ def test_prices_of_moves_that_can_be_large_take_one_relaxed_program(monkeypatch)
     decision = decide(problem, mampc.MoveRules(price=1.0), rng.standard_normal(3), 2 * rng.standard_normal(2))
     assert decision.status is Status.OPTIMAL
     assert 0 < len(rounds) <= ROUNDS
+
+
+def drawn_case(seed, scale_u=1.0):
+    """A problem, any rules that patterns compete under, and what is asked; inputs in other units."""
+    rng = np.random.default_rng([seed, 77])
+    m, n_c = [(2, 4), (2, 5), (3, 3), (1, 9)][seed % 4]
+    model = random_model(seed, n=3, m=m, l=2)
+    rules = mampc.MoveRules(
+        price=10.0 ** rng.uniform(-2, 1) * (seed % 3 > 0), counting=["elementwise", "simultaneous"][seed % 5 == 1],
+        dwell=1 + (seed % 7 == 2), max_moves=int(rng.integers(1, 6)) if seed % 3 == 0 or seed % 2 else None,
+        max_moves_per_step=1 if seed % 6 == 4 else None,
+    )  # fmt: skip
+    below, above, du_max = rng.uniform(0.2, 1.5, 3)
+    limits = mampc.Limits(
+        du_max=scale_u * du_max if seed % 8 < 4 else None, u_min=(model.u_op - below) * scale_u,
+        u_max=(model.u_op + above) * scale_u, y_max=model.y_op + 1 if seed % 4 == 1 else None,
+    )  # fmt: skip
+    scaled = mampc.StateSpace(
+        model.A, model.B / scale_u, model.C, None, 1.0, model.u_op * scale_u, model.y_op
+    )
+    problem = mampc.TrackingProblem(
+        scaled, prediction_horizon=n_c + 3, control_horizon=n_c, output_limit_weight=10.0,
+        move_weight=10.0 ** rng.uniform(-3, 0) * scale_u**-2.0, limits=limits,
+    )  # fmt: skip
+    return problem, rules, rng.standard_normal(3), model.y_op + 3 * rng.standard_normal(2)
+
+
+@pytest.mark.parametrize("seed", seeds(400, quick=40))
+def test_the_tree_proves_what_the_table_does_in_any_units(seed, monkeypatch):
+    by_table = decide(*drawn_case(seed))
+    monkeypatch.setattr(ranking, "LARGEST_TABLE", 0)
+    for scale in (1.0, [1e-4, 1e3][seed % 2]):
+        by_tree = decide(*drawn_case(seed, scale))
+        assert by_tree.status is by_table.status is Status.OPTIMAL
+        assert by_tree.objective == pytest.approx(by_table.objective, rel=1e-7)

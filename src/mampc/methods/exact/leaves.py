@@ -33,16 +33,14 @@ class Leaves(NamedTuple):
 
 
 class Rest(NamedTuple):
-    """What nodes leave when no move follows, each in its best term.
+    """What nodes leave when no move follows, in each term.
 
     Attributes:
-        term: the term, shape (N,).
-        value: the cost without prices.
-        residual: of the rows after the node's, shape (N, n - level).
+        value: the cost without prices, shape (N, K).
+        residual: of the rows after the node's, shape (N, n - level, K).
         inverse: of the normal matrix in the coordinates of the nodes' root, shape (N, q, q).
     """
 
-    term: Indices
     value: Array
     residual: Array
     inverse: Array
@@ -50,11 +48,9 @@ class Rest(NamedTuple):
 
 def finished(level: int, nodes: Nodes, squares: Squares, terms: Terms) -> tuple[Leaves, Rest]:
     """The nodes, which have decided `level` moves, with all later ones left out."""
-    every = np.arange(len(nodes.bound))
-    term = nodes.value.argmax(axis=1)
-    d, value, root = nodes.d[every, :, term], nodes.value[every, term], nodes.root
+    d, root = nodes.d, nodes.root
     A = squares.L[level:][:, nodes.chosen].transpose(1, 0, 2)
-    residual = terms.c[level:, term].T[:, :, None] - A @ d[:, :, None]
+    residual = terms.c[level:] - A @ d
     M = A @ root
     across = M.transpose(0, 2, 1)
     normal = across @ M
@@ -66,29 +62,37 @@ def finished(level: int, nodes: Nodes, squares: Squares, terms: Terms) -> tuple[
     if squares.refined:
         step = inverse @ (across @ residual - x)
         x, residual = x + step, residual - M @ step
-    value = value + np.square(x[:, :, 0]).sum(axis=1) + np.square(residual[:, :, 0]).sum(axis=1)
+    value = nodes.value + np.square(x).sum(axis=1) + np.square(residual).sum(axis=1)
     if nodes.low.shape[1]:
         variance = ((root @ inverse) * root).sum(axis=2)
-        value += lift(nodes.low, nodes.high, d[:, :, None] + root @ x, variance)[:, 0]
-    bound = np.maximum(nodes.bound, value + nodes.charge)
+        value += lift(nodes.low, nodes.high, d + root @ x, variance)
+    bound = np.maximum(nodes.bound, value.max(axis=1) + nodes.charge)
     leaves = Leaves(nodes.chosen, nodes.charge, nodes.low, nodes.high, bound)
-    return leaves, Rest(term, value, residual[:, :, 0], inverse)
+    return leaves, Rest(value, residual, inverse)
 
 
-def with_one_more(level: int, nodes: Nodes, rest: Rest, squares: Squares, terms: Terms) -> Array:
+def with_one_more(
+    level: int, nodes: Nodes, rest: Rest, squares: Squares, terms: Terms, limit: Array
+) -> Array:
     """What nodes without least sizes cost with one more move from `level` on alone, shape (N, n - level).
 
     Without prices. With r_t the gradient when no move follows and q_t the curvature left when the others adapt, t gains
-    r_t^2 / q_t.
+    r_t^2 / q_t. Terms that say more of a node come first, others only where a move is below its limit, (N, n - level).
     """
-    gradient = rest.residual @ squares.L[level:, level:-1]
     across = squares.normal[level:-1][:, nodes.chosen].transpose(1, 0, 2) @ nodes.root
     q = squares.curvature[level:] - ((across @ rest.inverse) * across).sum(axis=2)
     q = np.maximum(q, 1e-12 * squares.curvature[level:])
-    # The value is one of several that cancel here, so rounding counts.
-    return np.asarray(
-        rest.value[:, None] * (1 - 1e-12) - gradient * gradient / q - terms.support[level:-1, rest.term].T
-    )
+    bound = np.full(q.shape, -np.inf)
+    for term in np.argsort(-rest.value, axis=1).T:
+        rows = np.flatnonzero((bound < limit).any(axis=1))
+        if not len(rows):
+            break
+        term = term[rows]
+        gradient = rest.residual[rows, :, term] @ squares.L[level:, level:-1]
+        # The value is one of several that cancel here, so rounding counts.
+        value = rest.value[rows, term][:, None] * (1 - 1e-12) - terms.support[level:-1, term].T
+        bound[rows] = np.maximum(bound[rows], value - gradient * gradient / q[rows])
+    return bound
 
 
 def inverse_of(normal: Array) -> Array:
@@ -122,13 +126,3 @@ def appraised(leaves: Leaves, squares: Squares, terms: Terms, columns: list[int]
     else:
         value -= terms.support[:, columns][chosen].sum(axis=1)
     return leaves._replace(bound=np.maximum(leaves.bound, value.max(axis=1)))
-
-
-def together(first: Leaves, second: Leaves) -> Leaves:
-    """Both, of patterns without least sizes."""
-    size, w = len(first.bound), max(first.chosen.shape[1], second.chosen.shape[1])
-    chosen = np.full((size + len(second.bound), w), -1)
-    chosen[:size, : first.chosen.shape[1]] = first.chosen
-    chosen[size:, : second.chosen.shape[1]] = second.chosen
-    others = [np.concatenate(pair) for pair in zip(first[1:], second[1:], strict=True)]
-    return Leaves(chosen, *others)

@@ -14,12 +14,14 @@ node is given its own (see `branching`).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.methods.exact.branching import Branching
 from mampc.methods.exact.children import children_of
-from mampc.methods.exact.leaves import Leaves, Rest, appraised, finished, together, with_one_more
+from mampc.methods.exact.leaves import Leaves, appraised, finished, with_one_more
 from mampc.methods.exact.nodes import Nodes, lift, renewed, root_of, trimmed, variance_of
 from mampc.methods.exact.relaxation import Multipliers, Relaxation
 from mampc.methods.exact.sample_problem import SampleProblem
@@ -33,6 +35,7 @@ from mampc.program.sample import Indices, Sample
 
 CHUNK = 256  # nodes treated at once; half as many where each has three children
 TOGETHER = 64  # leaves tried at once
+FIRST = 4  # of the nodes that spend their budget; the others are tried when their turn comes
 SHARE = 0.5  # of the time limit that one relaxed program may take
 WORTH = 0.01  # of the gap at the root: prices of moves that can be large close nothing
 
@@ -117,6 +120,19 @@ class PatternTree:
         return close
 
 
+class _Pending(NamedTuple):
+    """Nodes of one level that wait, whose columns belong to the terms `ids`; none costs less than `least`."""
+
+    least: float
+    level: int
+    nodes: Nodes
+    ids: list[int]
+
+
+def _pending(level: int, nodes: Nodes, ids: list[int]) -> _Pending:
+    return _Pending(float(nodes.bound.min(initial=np.inf)), level, nodes, ids)
+
+
 class _BatchSearch:
     """The search of one sample, many nodes of one level at a time."""
 
@@ -125,9 +141,7 @@ class _BatchSearch:
         self._squares, self._order = problem.squares, problem.order
         self._left_at_root = problem.allowance.left
         # Nodes with one move left need no descendants: all last moves are priced at once.
-        self._resolves = not (
-            self._of.sized or self._of.simultaneous or self._squares.refined or self._left_at_root == 1
-        )
+        self._resolves = not (self._of.sized or self._of.simultaneous or self._squares.refined)
         # Another move never costs more: then only patterns that spend the whole budget are of interest.
         self._nested = self._of.simple and not (
             self._of.priced or self._of.sized or any(problem.allowance.frozen)
@@ -138,27 +152,39 @@ class _BatchSearch:
         problem, n = self._problem, len(self._order)
         chunk = CHUNK // 2 if self._of.sized else CHUNK
         root = self._bounded(0, root_of(self._terms, problem.allowance, self._of))
-        pending = [(0, root, list(self._terms.ids))]
+        pending = [_pending(0, root, list(self._terms.ids))]
         while pending:
             if problem.late:
                 return _least_bound(pending)
             # Depth first ends soonest; where no end is in sight, best bound first proves most.
-            level, nodes, ids = pending.pop(_best_of(pending) if problem.lasting else -1)
+            _, level, nodes, ids = pending.pop(_best_of(pending) if problem.lasting else -1)
             nodes = nodes.below(problem.cutoff)
             if not len(nodes.bound):
                 continue
             if len(nodes.bound) > chunk:
                 by_bound = np.argsort(nodes.bound, kind="stable")
-                pending.append((level, nodes.take(by_bound[chunk:]), ids))
+                pending.append(_pending(level, nodes.take(by_bound[chunk:]), ids))
                 nodes = nodes.take(by_bound[:chunk])
             nodes = self._renewed(level, nodes, ids)
             ids = list(self._terms.ids)
+            ended = nodes.used >= self._left_at_root - self._resolves
+            if ended.any() and (self._resolves or self._nested):
+                if self._resolves:
+                    self._try_last_moves(level, nodes.take(ended))
+                else:
+                    self._try(level, nodes.take(ended))
+                if problem.late:
+                    return _least_bound([*pending, _pending(level, nodes, ids)])
+                nodes = self._renewed(level, nodes.take(~ended), ids)
+                if not len(nodes.bound):
+                    continue
+                ids = list(self._terms.ids)
             children, made = children_of(level, nodes, problem)
             if made is not None:
-                self._try(level + 1, made)
+                self._try(level + 1, made if level + 1 == n or not self._nested else self._first(made))
                 if problem.late:
                     # These nodes bound their descendants, those just tried among them.
-                    return _least_bound([*pending, (level, nodes, ids)])
+                    return _least_bound([*pending, _pending(level, nodes, ids)])
             if level + 1 == n:
                 continue
             children = self._growable(level, children)
@@ -166,7 +192,7 @@ class _BatchSearch:
                 children = self._bounded(level + 1, self._renewed(level + 1, trimmed(children), ids))
                 children = self._sharpened(level + 1, children.below(problem.cutoff)).below(problem.cutoff)
             if len(children.bound):
-                pending.append((level + 1, children, list(self._terms.ids)))
+                pending.append(_pending(level + 1, children, list(self._terms.ids)))
         return np.inf
 
     def _renewed(self, level: int, nodes: Nodes, ids: list[int]) -> Nodes:
@@ -217,52 +243,50 @@ class _BatchSearch:
         of = self._of
         if self._order[level + 1] // of.n_inputs != self._order[level] // of.n_inputs:
             nodes = nodes._replace(now=np.zeros_like(nodes.now))
-        spent = nodes.used + self._resolves >= self._left_at_root
+        spent = nodes.used >= self._left_at_root
         if of.simultaneous:
             spent &= nodes.now == 0
         return nodes.take(~spent) if spent.any() else nodes
 
+    def _first(self, made: Nodes) -> Nodes:
+        """The most promising of those that have spent their budget."""
+        rows = np.flatnonzero(made.used >= self._left_at_root)
+        if len(rows) > FIRST:
+            rows = rows[np.argpartition(made.value[rows].max(axis=1), FIRST)[:FIRST]]
+        return made.take(rows)
+
     def _try(self, level: int, made: Nodes) -> None:
-        """Try the patterns of these nodes with no further move, or with the last one where one is left."""
-        left = self._left_at_root - made.used
-        if self._nested:
-            wanted = left == 1 if self._resolves else left == 0
-            if not wanted.any():
-                return
-            if not wanted.all():
-                made, left = made.take(wanted), left[wanted]
-        last = (left == 1) & self._resolves
-        made = trimmed(made)
-        leaves, rest = finished(level, made, self._squares, self._terms)
-        if level < len(self._order) and last.any():
-            if last.all():
-                more = self._with_last_moves(level, made, leaves, rest)
-            else:
-                some = Rest._make([array[last] for array in rest])
-                more = self._with_last_moves(level, made.take(last), leaves.take(last), some)
-            leaves = more if self._nested else together(leaves, more)
+        """Try the patterns of these nodes with no further move."""
+        if not len(made.bound):
+            return
+        leaves, _ = finished(level, trimmed(made), self._squares, self._terms)
+        self._try_all(leaves)
+
+    def _try_last_moves(self, level: int, nodes: Nodes) -> None:
+        """Try the patterns of these nodes with one more move, as far as they may beat the best plan."""
+        of, order, nodes = self._of, self._order[level:], trimmed(nodes)
+        leaves, rest = finished(level, nodes, self._squares, self._terms)
+        j, a = order // of.n_inputs, order % of.n_inputs
+        charge = leaves.charge[:, None] + of.price[a]
+        may = j >= nodes.last[:, a] + of.rules.dwell
+        if of.per_step < of.n_inputs:
+            may &= (j > j[0]) | (nodes.now[:, None] < of.per_step)
+        limit = np.where(may, self._problem.cutoff - charge, -np.inf)
+        bound = with_one_more(level, nodes, rest, self._squares, self._terms, limit) + charge
+        rows, columns = np.nonzero(may & (bound < self._problem.cutoff))
+        chosen = np.full((len(rows), int(nodes.width.max(initial=0)) + 1), -1)
+        chosen[:, : leaves.chosen.shape[1]] = leaves.chosen[rows]
+        chosen[np.arange(len(rows)), nodes.width[rows]] = level + columns
+        bound = np.maximum(bound[rows, columns], nodes.bound[rows])
+        self._try_all(Leaves(chosen, charge[rows, columns], leaves.low[rows], leaves.high[rows], bound))
+
+    def _try_all(self, leaves: Leaves) -> None:
+        """Try these patterns, some at once."""
         if len(leaves.bound) > TOGETHER:
             leaves = leaves.take(np.argsort(leaves.bound, kind="stable"))
         for first in range(0, len(leaves.bound), TOGETHER):
             if not self._try_leaves(leaves.take(slice(first, first + TOGETHER))):
                 return
-
-    def _with_last_moves(self, level: int, nodes: Nodes, leaves: Leaves, rest: Rest) -> Leaves:
-        """The patterns of these nodes with one more move, as far as they may beat the best plan."""
-        of, order = self._of, self._order[level:]
-        j, a = order // of.n_inputs, order % of.n_inputs
-        bound = with_one_more(level, nodes, rest, self._squares, self._terms)
-        bound = np.maximum(bound + leaves.charge[:, None] + of.price[a], nodes.bound[:, None])
-        may = (bound < self._problem.cutoff) & (j >= nodes.last[:, a] + of.rules.dwell)
-        if of.per_step < of.n_inputs:
-            current = j == int(self._order[level - 1]) // of.n_inputs
-            may &= ~current | (nodes.now[:, None] < of.per_step)
-        rows, columns = np.nonzero(may)
-        chosen = np.full((len(rows), int(nodes.width.max(initial=0)) + 1), -1)
-        chosen[:, : leaves.chosen.shape[1]] = leaves.chosen[rows]
-        chosen[np.arange(len(rows)), nodes.width[rows]] = level + columns
-        charge = leaves.charge[rows] + of.price[a[columns]]
-        return Leaves(chosen, charge, leaves.low[rows], leaves.high[rows], bound[rows, columns])
 
     def _try_leaves(self, leaves: Leaves) -> bool:
         """Try these patterns, best bound first; says whether others of larger bounds may be worth it."""
@@ -270,8 +294,6 @@ class _BatchSearch:
         left = leaves.bound < problem.cutoff
         if not left.any():
             return False
-        if len(terms.ids) > 1:
-            leaves = appraised(leaves.take(left), self._squares, terms, list(range(len(terms.ids))))
         while leaves.bound[row := int(leaves.bound.argmin())] < problem.cutoff:
             if problem.late:
                 return False
@@ -320,10 +342,10 @@ class _BatchSearch:
         return appraised(leaves, self._squares, self._terms, [self._terms.latest])
 
 
-def _best_of(pending: list[tuple[int, Nodes, list[int]]]) -> int:
+def _best_of(pending: list[_Pending]) -> int:
     """Which of them has the least bound; the deepest of several."""
-    return min(range(len(pending)), key=lambda k: (pending[k][1].bound.min(), -pending[k][0]))
+    return min(range(len(pending)), key=lambda k: (pending[k].least, -pending[k].level))
 
 
-def _least_bound(pending: list[tuple[int, Nodes, list[int]]]) -> float:
-    return float(min(nodes.bound.min(initial=np.inf) for _, nodes, _ in pending))
+def _least_bound(pending: list[_Pending]) -> float:
+    return min(nodes.least for nodes in pending)
