@@ -1,6 +1,6 @@
 """Random loops and the faults that befall them, for tests/test_fuzz.py."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,17 +40,30 @@ class Loop:
     reference_filter: mampc.ReferenceFilter | None = None
     counts: bool = False  # on later data, where that can be
     follows: bool = False  # the noise, with its price, where that can be
+    other: tuple[Any, ...] | None = None  # problem, rules, method and settings of a second variant
 
     @property
     def exactly_sparse(self):
         """Whether moves that the rules forbid are exactly zero."""
         return self.rules is not None and (self.method != "alternating" or self.settings["polish"])
 
-    def build(self):
+    def of(self, variant):
+        """The rules and method of a variant, as a loop of its own."""
+        if variant != "other":
+            return self
+        return replace(
+            self, **dict(zip(("problem", "rules", "method", "settings"), self.other, strict=True)), other=None
+        )
+
+    def controller(self):
         if self.rules is None:
-            controller = mampc.MPC(self.problem)
-        else:
-            controller = mampc.MAMPC(self.problem, self.rules, method=self.method, **self.settings)
+            return mampc.MPC(self.problem)
+        return mampc.MAMPC(self.problem, self.rules, method=self.method, **self.settings)
+
+    def build(self):
+        controller = self.controller()
+        if self.other is not None:
+            controller = mampc.ControllerBank({"first": controller, "other": self.of("other").controller()})
         settings = {
             "sensors": self.sensors, "max_blind_steps": self.max_blind_steps, "reference_filter": self.reference_filter
         }  # fmt: skip
@@ -155,6 +168,14 @@ def levels(kind, limits):
 
 
 @st.composite
+def second_rules(draw, n_c):
+    """Rules, method and settings of the second variant of a bank."""
+    method = draw(st.sampled_from(["mpc", "exact", "greedy"]))
+    rules = None if method == "mpc" else mampc.MoveRules(**draw(move_rules(n_c)))
+    return rules, method, SPARSE.get(method, {})
+
+
+@st.composite
 def loops(draw):
     """A regulator: problem, rules and method, estimator and sensor checks."""
     model, estimator, scale = draw(models())
@@ -186,6 +207,9 @@ def loops(draw):
         rules = mampc.MoveRules(
             **draw(move_rules(n_c)), min_size=size if size <= most else 0.0, levels=told
         )  # fmt: skip
+    other = None
+    if draw(st.integers(0, 3)) == 0:
+        other = replace(problem, move_weight=0.3 * problem.move_weight), *draw(second_rules(n_c))
     with_range = draw(st.booleans())
     sensors = mampc.SensorChecks(
         y_low=model.y_op - 20 * scale if with_range else None,
@@ -198,7 +222,7 @@ def loops(draw):
     blind = draw(st.sampled_from([0, 0, 2, 5]))
     counts = draw(st.booleans())
     follows = counts and draw(st.booleans())
-    return Loop(problem, rules, method, settings, estimator, sensors, blind, smooth, counts, follows)
+    return Loop(problem, rules, method, settings, estimator, sensors, blind, smooth, counts, follows, other)
 
 
 # Faults. Each is drawn for as many signals as there can be, and cut to those that there are.

@@ -174,3 +174,28 @@ def test_variants_with_other_bounds_share_a_state():
 def test_what_does_not_fit_is_refused_in_words(made, expected):
     with pytest.raises(mampc.MampcError, match=expected):
         made()
+
+
+@pytest.mark.parametrize("estimator", ["kalman", "bank", "counting"])
+def test_arrays_step_every_variant_as_one_loop_does(estimator, monkeypatch):
+    """Loops under a bank go as arrays; the few ordinary steps are those that other controllers have too."""
+    model = identified_tank()
+    made = mampc.ControllerBank(variants(model))
+    loads = None if estimator == "kalman" else mampc.LoadBank(model, noise=0.1)
+    regulator = mampc.Regulator(made, loads, value_of_information=estimator == "counting")
+    ours = mampc.simulate(
+        TANK, regulator, reference(40), noise=0.1, variant=switched(40), seed=1, progress=False
+    )
+    stepped, step = [], mampc.Regulator.step
+    monkeypatch.setattr(mampc.Regulator, "step", lambda *a, **k: stepped.append(1) or step(*a, **k))
+    batch = mampc.simulate_batch(
+        TANK, regulator, reference(40), seeds=[0, 1], noise=0.1, variant=switched(40), progress=False
+    )
+    np.testing.assert_allclose(batch.u[1], ours.u, atol=1e-9)
+    assert len(stepped) < 40
+
+
+def test_a_bank_without_sparse_variants_cannot_count_on_later_data():
+    bank = mampc.ControllerBank({"plain": variants()["plain"]})
+    with pytest.raises(mampc.MampcError, match="a bank of them"):
+        mampc.Regulator(bank, mampc.LoadBank(bank.problem.model, noise=0.1), value_of_information=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mampc
 from mampc.study import load_study, parse_study, run_study
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -82,6 +83,26 @@ def test_the_more_important_level_stays_within_its_limit():
         for run in runs.values():
             assert run.y[-1, 0] < 22.0
             assert (run.y[-1, 1] <= 41.0) == kept
+
+
+def test_a_slider_is_brisk_where_it_was_asked_to_be_and_calm_elsewhere(found, tmp_path):
+    runs = found("operators-slider")["a day"]
+    slider, brisk = slice(65, 120), runs["brisk"]
+    assert [d.variant for d in runs["slider"].decisions[slider]] == ["brisk"] * 55
+
+    def moves(run, part):
+        return np.count_nonzero(np.diff(run.u, axis=0, prepend=run.u_initial[None])[part])
+
+    def error(run, part):
+        return ((run.y - run.r)[part] ** 2).sum(axis=1).mean()
+
+    np.testing.assert_array_equal(runs["slider"].u[:65], runs["calm"].u[:65])
+    calm, ours = runs["calm"], runs["slider"]
+    assert error(ours, slider) < 0.9 * error(calm, slider)
+    assert moves(calm, slice(None)) < moves(ours, slice(None)) < 0.8 * moves(brisk, slice(None))
+    path = tmp_path / "a-day_slider.csv"
+    ours.to_csv(path)
+    assert set(mampc.Recording.from_csv(path, ours.names).variant) == {"calm", "brisk"}
 
 
 def test_compensated_valves_need_fewer_moves_at_a_smaller_error(found):

@@ -78,7 +78,7 @@ class FaultyLoop(RuleBasedStateMachine):
         self.x = np.zeros(self.model.n_states)
         self.y_last, self.v_last = self.model.y_op, self.model.v_op
         self.reference, self.present, self.manual = self.model.y_op, None, None
-        self.held = self.fresh = False
+        self.held, self.fresh, self.variant = False, False, None
 
     @property
     def history(self):
@@ -98,6 +98,20 @@ class FaultyLoop(RuleBasedStateMachine):
             rows[at:] = np.ma.masked_invalid(np.ma.array(reference, dtype=float))
             reference = rows
         self.reference = reference
+
+    @precondition(lambda self: self.loop.other is not None)
+    @rule(variant=st.sampled_from(["first", "other"]))
+    def switch_the_variant(self, variant):
+        self.variant = variant
+
+    @precondition(lambda self: self.problem.zoned.any())
+    @rule(below=st.floats(0.0, 2.0), above=st.sampled_from([0.0, 0.5, np.inf, np.nan]), ahead=st.booleans())
+    def ask_for_a_zone(self, below, above, ahead):
+        zoned = self.problem.zoned
+        ends = np.array([self.model.y_op - below * zoned, self.model.y_op + np.where(zoned, above, 0.0)])
+        if ahead:
+            ends = np.tile(ends[:, None], (1, self.problem.prediction_horizon + 1, 1))
+        self.reference = mampc.Zone(*ends)
 
     @rule(told=fuzzing.PRESENT)
     def limit_now(self, told):
@@ -199,7 +213,8 @@ class FaultyLoop(RuleBasedStateMachine):
             u_applied, told = fuzzing.spoilt(decided, applied, before)
             self.believed.told(told, self.manual)
         arguments = {
-            "u_applied": u_applied, "measured_disturbance": v, "limits": self.present, "manual": self.manual
+            "u_applied": u_applied, "measured_disturbance": v, "limits": self.present, "manual": self.manual,
+            "variant": self.variant,
         }  # fmt: skip
         decision = self.regulator.step(self.state, y, self.reference, **arguments)
         STEPPED[decision.status] += 1
@@ -229,7 +244,8 @@ class FaultyLoop(RuleBasedStateMachine):
         assert np.isfinite(decision.plan).all()
         assert np.isfinite(decision.changes).all()
         by_hand = np.zeros(len(u), dtype=bool) if self.manual is None else np.array(self.manual)
-        levels = self.regulator.controller.levels
+        chosen = self.regulator.controller
+        levels = (chosen if self.loop.other is None else chosen.variants[self.variant or "first"]).levels
         values = [None] * len(u) if levels is None else levels.values
         off = np.array(
             [known is not None and at not in known for at, known in zip(last, values, strict=True)]
@@ -262,8 +278,9 @@ class FaultyLoop(RuleBasedStateMachine):
             assert np.isfinite(decision.objective)
             assert decision.objective >= decision.lower_bound - 1e-6 * max(1.0, abs(decision.objective))
         assert ((decision.violations >= 0) | np.isnan(decision.violations)).all()
-        rules = self.loop.rules
-        if self.loop.exactly_sparse and not UNRULED & set(decision.remarks):
+        loop = self.loop.of(self.variant)
+        rules = loop.rules
+        if loop.exactly_sparse and not UNRULED & set(decision.remarks):
             past = np.array(self.history[-max(rules.sparsity_horizon, rules.dwell) :])
             assert keeps_rules(rules, past, decision.moves)
             own = np.abs(u - last)
@@ -276,7 +293,8 @@ class FaultyLoop(RuleBasedStateMachine):
         names, faults = self.model.names.outputs, decision.ignored_outputs
         missing = {name for name, usable in zip(names, is_usable(y), strict=True) if not usable}
         assert missing == {name for name, fault in faults.items() if fault is Fault.MISSING}
-        if not is_usable(self.reference).all() or (
+        zone, asked = isinstance(self.reference, mampc.Zone), self.reference
+        if (np.isnan(asked.high).any() if zone else not is_usable(asked).all()) or (
             set(names) == set(faults) and not self.loop.max_blind_steps
         ):
             assert decision.status is Status.HELD_BAD_MEASUREMENT

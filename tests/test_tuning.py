@@ -312,3 +312,29 @@ def test_the_regulator_of_the_study_that_is_written_decides_as_the_one_found(noi
     ]
     np.testing.assert_allclose(runs[1].u, runs[0].u, atol=1e-9)
     assert (np.diff(runs[0].u, axis=0) != 0).any()
+
+
+def test_a_slider_goes_from_calm_to_brisk(tank):
+    regulator = tank.bank(5)
+    bank, price = regulator.controller, tank.rules.price
+    assert list(bank.variants) == ["tuned", "calm 1", "calm 2", "brisk 1", "brisk 2"]
+    assert bank.usual == "tuned"
+    prices = [one.rules.price / price for one in bank.variants.values()]
+    np.testing.assert_allclose(prices, [1.0, 2.0, 4.0, 0.5, 0.25])
+    reference = mampc.steps(60, tank.problem.model.y_op, [(5, tank.problem.model.y_op + 3.0)])
+    loops = {"seeds": range(8), "noise": tank.noise, "progress": False}
+    moves = []
+    for name in ("calm 2", "tuned", "brisk 2"):
+        batch = mampc.simulate_batch(tank.problem.model, regulator, reference, variant=name, **loops)
+        moves.append(batch.metrics().moves.sum())
+    assert moves == sorted(moves)
+    assert moves[0] < moves[2]
+    alone = mampc.simulate(tank.problem.model, tank.regulator, reference, noise=tank.noise)
+    same = mampc.simulate(tank.problem.model, regulator, reference, noise=tank.noise)
+    np.testing.assert_array_equal(same.u, alone.u)
+
+
+def test_a_slider_has_a_middle(tank):
+    for positions in (1, 4):
+        with pytest.raises(mampc.MampcError, match="positions: expected"):
+            tank.bank(positions)

@@ -18,7 +18,7 @@ from mampc.base.errors import MampcError
 from mampc.base.progress import watched
 from mampc.compare.fronts import FEWEST, Estimate, Point, non_dominated
 from mampc.compare.scenarios import Scenarios, Surroundings, usual_problem
-from mampc.controllers import MAMPC, MPC
+from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.loop.estimation import Estimator, KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.regulator import Regulator
@@ -211,6 +211,41 @@ class Tuned:
         if isinstance(self.estimator, LoadBank) and not self.is_plain:
             return Candidate("", self.problem, self.estimator, self.noise_guessed).regulator(price)
         return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.estimator)
+
+    def bank(self, positions: int = 5, *, span: float = REFINE_SPAN) -> Regulator:
+        """An operator's slider from calm to brisk: a `ControllerBank` of prices about the one found.
+
+        Args:
+            positions: how many, an odd number; "tuned" is the middle one and decides where none is named, "calm 1",
+                "calm 2", ... move less and "brisk 1", "brisk 2", ... track better.
+            span: the calmest price over the one found, and that over the briskest.
+
+        Raises:
+            MampcError: an even number, or nothing better than plain MPC found.
+        """
+        side, span = as_whole("positions", positions, 3) // 2, as_number("span", span, 1.0, exclusive=True)
+        if positions % 2 == 0:
+            raise MampcError(
+                f"positions: expected an odd number, with the one found in the middle, received {positions}"
+            )
+        if self.is_plain:
+            raise MampcError(
+                "bank: expected a price to go up and down from, received plain MPC, which has none"
+            )
+        ways = [("calm", span), ("brisk", 1 / span)]
+        prices = {"tuned": self.rules.price} | {
+            f"{word} {k}": self.rules.price * far ** (k / side)
+            for word, far in ways
+            for k in range(1, side + 1)
+        }
+        variants = {
+            name: MAMPC(self.problem, replace(self.rules, price=price)) for name, price in prices.items()
+        }
+        counts = isinstance(self.estimator, LoadBank)
+        return Regulator(
+            ControllerBank(variants), self.estimator, value_of_information=counts,
+            price_follows_noise=counts and self.noise_guessed,
+        )  # fmt: skip
 
     @property
     def is_plain(self) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from copy import copy
 from typing import Any
 
+from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState, Decision
@@ -95,6 +96,17 @@ class ControllerBank(Controller):
         decision = controller.step(state, x, reference, **now)
         after = decision.state if alike else decision.state._replace(active=None)
         return decision._replace(variant=name, state=after)
+
+    def with_information(self, shifts: Array, *, price_follows_noise: bool = False) -> ControllerBank:
+        """This bank with plans of its `MAMPC` that count on later data; see `MAMPC.with_information`."""
+        counting = copy(self)
+        counting.variants = {
+            name: one.with_information(shifts, price_follows_noise=price_follows_noise)
+            if isinstance(one, MAMPC)
+            else one
+            for name, one in self.variants.items()
+        }
+        return counting
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
         return self.variants[self.usual].plan(sample, state)

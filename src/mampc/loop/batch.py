@@ -342,8 +342,9 @@ class _Loops:
         parameters -= place.origin[parameters.shape[1]]
         usable: BoolArray = np.asarray((np.abs(parameters) < LARGEST).all(axis=1))
         decided, first = self._plans.decide(
-            np.where(usable[:, None], parameters, 0.0), self._inputs, estimator.weights_of(estimate)
-        )
+            np.where(usable[:, None], parameters, 0.0), self._inputs, estimator.weights_of(estimate),
+            None if self._courses[0].variants is None else self._courses[0].variants[k],
+        )  # fmt: skip
         decided &= fine & usable
         one_by_one = np.flatnonzero(~decided).tolist()
         before = [self._state(s, k) for s in one_by_one]
@@ -357,7 +358,9 @@ class _Loops:
         for loop in np.flatnonzero(decided) if any(active is not None for active in self._active) else ():
             self._active[loop] = None
         for s, state in zip(one_by_one, before, strict=True):
-            self._step_one(s, state, y[s], self._courses[s].asked(k, self._n_p and self._n_p + 1), told[s])
+            asked_now = self._courses[s].asked(k, self._n_p and self._n_p + 1)
+            beside = self._courses[s].told(k, told[s] if self._has_v else None)
+            self._step_one(s, self._regulators[s].step(state, y[s], asked_now, **beside))
         return self._inputs[:, -1]
 
     def _state(self, s: int, k: int) -> RegulatorState:
@@ -372,10 +375,8 @@ class _Loops:
             None if self._tracked is None else self._tracked[s].copy(),
         )
 
-    def _step_one(self, s: int, state: RegulatorState, y: Array, asked: Array | Zone, v: Array) -> None:
+    def _step_one(self, s: int, decision: Decision) -> None:
         """An ordinary step of one loop."""
-        told: dict[str, Any] = {"measured_disturbance": v} if self._has_v else {}
-        decision = self._regulators[s].step(state, y, asked, **told)
         state = decision.state
         self._inputs[s], self._active[s] = state.controller.inputs, state.controller.active
         for stack, own in ((self._estimate, state.estimate), (self._sensors, state.sensors)):

@@ -19,7 +19,7 @@ import numpy as np
 
 from mampc.base.checks import LARGEST, Array, BoolArray
 from mampc.base.tolerances import INSIDE, ROUNDING, SAME, TIE
-from mampc.controllers import MAMPC, MPC
+from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.methods import Exact
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
@@ -78,6 +78,10 @@ class BatchedPlans:
         """
         decided, _, first = self._free.at(parameters)
         return decided & ((first >= self._low) & (first <= self._high)).all(axis=1), first
+
+    def under(self, variant: str | None) -> BatchedPlans:
+        """The plans under a variant of a bank."""
+        return self
 
 
 class PatternTable:
@@ -229,6 +233,16 @@ class BatchedRule(BatchedPlans):
         return decided & ((first >= self._low) & (first <= self._high)).all(axis=1), first
 
 
+class BatchedBank(BatchedPlans):
+    """The plans of the variants of a bank, all loops under the same one at a sample."""
+
+    def __init__(self, bank: ControllerBank, variants: dict[str, BatchedPlans]) -> None:
+        self._variants, self._usual, self.memory = variants, bank.usual, bank.memory
+
+    def under(self, variant: str | None) -> BatchedPlans:
+        return self._variants[self._usual if variant is None else variant]
+
+
 class EachPlans:
     """The plans of loops that have a controller each."""
 
@@ -239,15 +253,17 @@ class EachPlans:
         ]
 
     def decide(
-        self, parameters: Array, inputs: Array, hypotheses: Array | None = None
+        self, parameters: Array, inputs: Array, hypotheses: Array | None = None, variant: str | None = None
     ) -> tuple[BoolArray, Array]:
-        """As in `BatchedPlans`."""
+        """As in `BatchedPlans`, under a variant of banks."""
         if len(self._groups) == 1:
-            return self._groups[0][0].decide(parameters, inputs, hypotheses)
+            return self._groups[0][0].under(variant).decide(parameters, inputs, hypotheses)
         decided, first = np.empty(len(inputs), dtype=bool), np.empty_like(inputs[:, -1])
         for plans, loops in self._groups:
             likely = None if hypotheses is None else hypotheses[loops]
-            decided[loops], first[loops] = plans.decide(parameters[loops], inputs[loops], likely)
+            decided[loops], first[loops] = plans.under(variant).decide(
+                parameters[loops], inputs[loops], likely
+            )
         return decided, first
 
 
@@ -272,6 +288,8 @@ def _plans_of(controller: Controller, preview: bool, like: BatchedPlans | None) 
     if type(controller) is Rounded or (type(controller) is DeadBand and controller.kind == "each"):
         inner = _plans_of(controller.controller, preview, None)
         return None if inner is None else BatchedRule(controller, preview, inner)
+    if isinstance(controller, ControllerBank):
+        return _plans_of_bank(controller, preview)
     if type(controller) is not MAMPC or type(controller.method) is not Exact:
         return None
     problem = controller.problem
@@ -285,3 +303,16 @@ def _plans_of(controller: Controller, preview: bool, like: BatchedPlans | None) 
     n = controller.condensed.n_moves
     patterns = admissible.listed(LARGEST_TABLE // (n * (n + 1) // 2))
     return None if patterns is None else BatchedExact(controller, preview, admissible, patterns, like)
+
+
+def _plans_of_bank(bank: ControllerBank, preview: bool) -> BatchedPlans | None:
+    """None where a variant is stepped loop by loop, or has zones of its own."""
+    first, found = bank.problem, dict[str, BatchedPlans]()
+    for name, controller in bank.variants.items():
+        own = controller.problem
+        alike = (own.zone_below == first.zone_below).all() and (own.zone_above == first.zone_above).all()
+        plans = _plans_of(controller, preview, None) if alike else None
+        if plans is None:
+            return None
+        found[name] = plans
+    return BatchedBank(bank, found)

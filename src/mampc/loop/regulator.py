@@ -351,10 +351,11 @@ def _with_information(planner: Controller, estimator: Estimator, price_follows_n
     Raises:
         MampcError: another controller than `MAMPC`, or an estimator that does not know its noise in output units.
     """
-    if type(planner) is not MAMPC:
+    if type(planner) not in (MAMPC, ControllerBank) or not any(type(one) is MAMPC for one in planner.each):
         raise MampcError(
-            f"value_of_information: expected a controller MAMPC, received {type(planner).__name__}"
+            f"value_of_information: expected a controller MAMPC, or a bank of them, received {type(planner).__name__}"
         )
+    assert isinstance(planner, MAMPC | ControllerBank)
     shifts = estimator.shifts(planner.problem.control_horizon - 1)
     if shifts is None:
         raise MampcError(

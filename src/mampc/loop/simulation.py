@@ -236,7 +236,7 @@ def acting_on(
     return Acting(
         dt=model.dt, reference=rows[ahead], zone=zone, spread=spread, at=at,
         loads=loads, u_initial=start, stems=None if valves is None else valves.initial(start),
-        variants=_variants(variant, T),
+        variants=_variants(variant, T, regulator.controller),
     )  # fmt: skip
 
 
@@ -300,13 +300,22 @@ def at_rest(
     return x, regulator.initial_state(u, y, **told)
 
 
-def _variants(variant: str | Sequence[str] | None, T: int) -> list[str] | None:
-    if variant is None or isinstance(variant, str):
-        return None if variant is None else [variant] * T
-    names = list(variant) if isinstance(variant, Sequence) else [variant]
+def _variants(variant: str | Sequence[str] | None, T: int, controller: Controller) -> list[str] | None:
+    if variant is None:
+        return None
+    if not isinstance(controller, ControllerBank):
+        raise MampcError(f"variant: expected none without a ControllerBank, received {shown(variant)}")
+    names = (
+        [variant] * T if isinstance(variant, str) else list(variant) if isinstance(variant, Sequence) else []
+    )
     if len(names) != T or not all(isinstance(name, str) for name in names):
         raise MampcError(
             f"variant: expected a name or one for each of {T} samples, received {shown(variant)}"
+        )
+    unknown = sorted(set(names) - set(controller.variants))
+    if unknown:
+        raise MampcError(
+            f"variant: expected one of {', '.join(controller.variants)}, received {unknown[0]!r}"
         )
     return names
 

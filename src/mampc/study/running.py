@@ -145,7 +145,7 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
         valves = study.actuators.valves()
         table = _executed(table, valves, model.n_inputs)
     controller = _controller(problem, table, study.controllers)
-    counts = study.estimator.value_of_information and type(controller) is MAMPC
+    counts = study.estimator.value_of_information and any(type(one) is MAMPC for one in controller.each)
     smooth = None if table.reference_filter is None else table.reference_filter.made()
     try:
         return Regulator(
