@@ -15,6 +15,7 @@ import fuzzing
 import mampc
 from mampc import Fault, Remark, Status
 from referees import keeps_rules
+from seeds import seeds
 
 LARGEST = 1e12  # beyond it no number is believed
 STEPPED: Counter[str] = Counter()  # steps of the regulator by status; `conftest` prints them
@@ -371,3 +372,36 @@ def test_a_penalty_grows_no_further_than_a_solver_can_follow():
     controller = mampc.MAMPC(problem, mampc.MoveRules(max_moves=1), method="penalty_decomposition")
     for size in (1.0, 1e6, 1e11):
         assert not controller.step(controller.initial_state(), [0.3 * size], [-size]).held
+
+
+@pytest.mark.parametrize("seed", seeds(40, quick=3))
+def test_compensated_valves_survive_whatever_the_data(seed):
+    """Commands keep their limits, states are plain numbers, and nothing raises; healthy data bring decisions back."""
+    rng = np.random.default_rng(seed)
+    model = mampc.StateSpace.from_first_order(
+        gain=[[1.0, 0.4], [0.3, 0.8]], time_constant=[[6.0, 4.0], [5.0, 8.0]], dt=1.0
+    )
+    limits = mampc.Limits(u_min=[0.0, -1.0], u_max=[4.0, 1.0])
+    problem = mampc.TrackingProblem(model, prediction_horizon=6, control_horizon=2, limits=limits)
+    rules = mampc.MoveRules(price=0.05, min_size=0.1, max_moves=[None, 2][seed % 2], sparsity_horizon=4)
+    valves = mampc.Valves(band=[0.2, 0.3], jump=0.05)
+    regulator = mampc.Regulator(mampc.MAMPC(problem, rules), valves=valves)
+    state = regulator.initial_state()
+
+    def spoilt(size):
+        return np.where(rng.random(2) < 0.3, rng.choice(fuzzing.EXTREMES, 2), size * rng.standard_normal(2))
+
+    for sample in range(60):
+        healthy = sample >= 50
+        told = {} if healthy else {
+            "u_applied": spoilt(1.0) if rng.random() < 0.4 else None,
+            "manual": rng.random(2) < 0.3 if rng.random() < 0.3 else None,
+            "limits": mampc.Limits(u_max=spoilt(3.0)) if rng.random() < 0.2 else None,
+        }  # fmt: skip
+        y = 0.01 * rng.standard_normal(2) if healthy else spoilt(0.3)
+        decision = regulator.step(state, y, np.ones(2) if healthy else spoilt(1.0), **told)
+        assert isinstance(decision.status, Status)
+        assert ((decision.u >= [0.0, -1.0]) & (decision.u <= [4.0, 1.0])).all()
+        state = regulator.state_from_json(decision.state.to_json())
+        assert state.to_json() == decision.state.to_json()
+    assert not decision.held
