@@ -46,7 +46,7 @@ def test_there_is_no_limit_cycle_and_fewer_moves_at_a_smaller_error(band, jump):
 def test_under_noise_fewer_moves_do_at_no_larger_error(band, jump):
     valves = mampc.Valves(band=band, jump=jump)
     moves, errors = np.zeros(2), np.zeros(2)
-    for seed in range(3):
+    for seed in range(examples(3, quick=2)):
         for k, regulator in enumerate((loop(None), loop(valves, jump, price=0.4))):
             run = run_of(regulator, valves, noise=0.1, seed=seed)
             moves[k] += moved(run.u).sum()

@@ -106,7 +106,7 @@ def both_bookkeepings(monkeypatch):
         yield name
 
 
-@pytest.mark.parametrize("seed", seeds(300, quick=30))
+@pytest.mark.parametrize("seed", seeds(300, quick=15))
 def test_the_optimum_is_that_of_brute_force_with_both_bookkeepings(seed, monkeypatch):
     case = random_case(seed)
     problem, rules, past, x, reference = case
@@ -231,7 +231,7 @@ class Clock:
         return 1e-3 * self.looks
 
 
-@pytest.mark.parametrize("seed", seeds(10, quick=4))
+@pytest.mark.parametrize("seed", seeds(10, quick=2))
 @pytest.mark.parametrize("table", [0, 3_000_000])
 def test_out_of_time_the_best_plan_so_far_comes_with_a_valid_bound(seed, table, monkeypatch):
     monkeypatch.setattr(ranking, "LARGEST_TABLE", table)
@@ -272,7 +272,7 @@ def test_the_time_limit_is_kept_where_the_proof_is_out_of_reach(least_size, monk
     assert_keeps_limits_and_rules(case, decision)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", seeds(40, quick=15))
 def test_rules_that_forbid_nothing_give_plain_mpc_and_those_that_forbid_all_hold(seed, monkeypatch):
     problem, _, past, x, reference = random_case(seed)
     plain = mampc.MPC(problem)
@@ -296,7 +296,7 @@ def test_rules_that_forbid_nothing_give_plain_mpc_and_those_that_forbid_all_hold
 def test_other_methods_certified_report_a_valid_bound_and_an_objective_as_planned(method):
     settings = {"warm_up": 0, "polish": True} if method == "alternating" else {}
     proven = 0
-    for seed in range(0, examples(300, quick=80), 4):
+    for seed in range(0, examples(300, quick=40), 4):
         problem, rules, past, x, reference = case = random_case(seed)
         best = best_value(seed, rules)
         plain, certified = decide(case, method, **settings), decide(case, method, certify=True, **settings)

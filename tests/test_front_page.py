@@ -39,7 +39,7 @@ settings = { band = 1e6 }
 def sweep():
     text = template().replace("steps = 145", "steps = 60").replace("at = 100", "at = 40")
     text = text[: text.index("[[controllers]]")] + CONTROLLERS
-    return Sweep(parse_study(text), seeds=3, points=5)
+    return Sweep(parse_study(text), seeds=2, points=4)
 
 
 @pytest.fixture(scope="module")

@@ -96,14 +96,14 @@ def fullest_window(rules, moves):
 
 
 @given(loop=loops())
-@settings(max_examples=examples(100, quick=25), deadline=None)
+@settings(max_examples=examples(100, quick=15), deadline=None)
 def test_applied_moves_of_the_exact_method_keep_the_rules(loop):
     assert_keeps_rules(loop[1], loop[0].limits, applied(*loop, "exact"))
 
 
 @pytest.mark.parametrize("method", [name for name in POLISHED if name != "exact"])
 @given(loop=loops())
-@settings(max_examples=examples(20, quick=5), deadline=None)
+@settings(max_examples=examples(20, quick=3), deadline=None)
 def test_applied_moves_of_the_other_methods_keep_the_rules(method, loop):
     assert_keeps_rules(loop[1], loop[0].limits, applied(*loop, method))
 

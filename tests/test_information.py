@@ -11,6 +11,7 @@ from mampc import Status
 from mampc.loop.hypotheses import HYPOTHESES
 from mampc.methods.exact import search
 from referees import all_patterns, best_on_every_pattern, charge, keeps_rules
+from seeds import seeds
 from test_load_bank import driven
 
 LEVEL = mampc.StateSpace([[1.0, 0.3], [0.0, 0.6]], [[0.1], [0.4]], [[1.0, 0.0]], None, 1.0, [5.0], [3.0])
@@ -105,7 +106,7 @@ def test_it_falls_with_every_move_and_is_nothing_where_all_are_free(name):
 
 @pytest.mark.parametrize("limit", [None, 0.6])
 @pytest.mark.parametrize("method", ["table", "tree"])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", seeds(8, quick=4))
 def test_the_exact_search_finds_the_best_plan_and_proves_it(seed, method, limit, monkeypatch):
     if method == "tree":
         monkeypatch.setattr(search, "ranking_of", lambda *_: None)

@@ -9,6 +9,7 @@ import mampc
 from builders import cost_of, random_model
 from mampc.study import parse_study, run_study, template
 from referees import best_on_every_pattern, charge, keeps_rules, objective_of, program_of, scip_bounds
+from seeds import seeds
 
 WIDE = mampc.Limits(u_min=-3.0, u_max=3.0)
 
@@ -109,7 +110,7 @@ def test_a_cost_moves_the_load_to_the_cheaper_input():
     np.testing.assert_allclose(run.u[-1], found.u, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", seeds(12, quick=6))
 def test_loops_come_to_rest_where_targets_says(seed):
     problem, rng = random_problem(seed, prediction_horizon=12)
     model = problem.model

@@ -10,6 +10,7 @@ import mampc
 from builders import random_model
 from mampc import Remark, Status
 from referees import keeps_rules, keeps_timings, moved, objective_of, scip_on_levels
+from seeds import examples, seeds
 
 METHODS = {name: {"polish": True} if name == "alternating" else {} for name in mampc.METHODS}
 
@@ -70,7 +71,7 @@ def on_levels(plan, levels):
     return all(np.isin(plan[..., a], values).all() for a, values in enumerate(levels) if values is not None)
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", seeds(30, quick=12))
 def test_no_course_on_the_levels_is_better(seed):
     m = 1 + seed % 2
     n_c = 3 if m == 2 else 5
@@ -85,7 +86,7 @@ def test_no_course_on_the_levels_is_better(seed):
     assert decision.gap == 0
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", seeds(12, quick=5))
 def test_no_course_on_many_levels_is_better(seed):
     """These are searched pattern by pattern where moves have a price."""
     rng, problem, levels, x, past, reference = instance(seed, 1, 3, few=False)
@@ -205,14 +206,14 @@ def test_every_method_stays_on_levels_and_is_certified(method, levels):
     certify = {} if method == "exact" else {"certify": True}
     regulator = loop_of(method, levels, settings=METHODS[method] | certify)
     model = regulator.controller.problem.model
-    reference = mampc.steps(12, model.y_op, [(3, model.y_op + 1.0)])
+    reference = mampc.steps(examples(12, quick=8), model.y_op, [(3, model.y_op + 1.0)])
     run = mampc.simulate(model, regulator, reference, noise=0.1, u_initial=[0.0, 0.0])
     known = regulator.controller.levels.values
     assert on_levels(run.u, [None if v is None else v.tolist() for v in known])
     for decision in run.decisions[1:]:
         assert on_levels(decision.plan, known)
         assert decision.gap < np.inf
-    exact = mampc.simulate(model, loop_of("exact", levels), reference, noise=0.1, u_initial=[0.0, 0.0])
+    exact = mampc.simulate(model, loop_of("exact", levels), reference[:1], noise=0.1, u_initial=[0.0, 0.0])
     assert run.decisions[0].objective >= exact.decisions[0].objective * (1 - 1e-9)
 
 

@@ -70,7 +70,7 @@ def best_by_cvxpy(problem, limits, x, u_previous, reference, pattern):
     return problem_.value if problem_.status == "optimal" else np.inf
 
 
-@pytest.mark.parametrize("seed", seeds(12, quick=3))
+@pytest.mark.parametrize("seed", seeds(12, quick=1))
 def test_limits_that_vary_over_the_horizon_are_those_of_the_optimum(seed):
     """Every pattern with at most two moves by an independent solver against the exact search; and plain MPC."""
     rng, problem = np.random.default_rng(seed), random_problem(seed)
@@ -98,7 +98,7 @@ def test_limits_that_vary_over_the_horizon_are_those_of_the_optimum(seed):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3, quick=1))
 def test_every_method_keeps_limits_told_at_run_time(method, seed):
     rng, problem = np.random.default_rng(seed), random_problem(seed)
     controller, model = controller_of(method, problem), problem.model

@@ -58,7 +58,7 @@ def decide(controller, past, x, reference):
 @every_rule
 @every_method
 def test_plans_keep_limits_and_rules_and_cost_what_they_say(name, rules):
-    for seed in range(4):
+    for seed in range(examples(4, quick=2)):
         problem, past, x, reference = sample(seed)
         decision = decide(controller_of(problem, rules, name), past, x, reference)
         changes = np.diff(np.vstack([past[-1:], decision.plan]), axis=0)
@@ -75,7 +75,7 @@ def test_plans_keep_limits_and_rules_and_cost_what_they_say(name, rules):
 @every_rule
 @every_heuristic
 def test_no_plan_is_better_than_the_proven_optimum(name, rules):
-    for seed in range(4):
+    for seed in range(examples(4, quick=2)):
         asked = sample(seed)
         best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
         found = decide(controller_of(asked[0], rules, name), *asked[1:])
@@ -102,7 +102,7 @@ def test_a_budget_of_all_moves_gives_the_plan_of_plain_mpc(name, narrow):
 @every_heuristic
 @pytest.mark.parametrize("rules", [RULES["budget"], RULES["budget and price"]])
 def test_a_certificate_holds_the_proven_optimum(name, rules):
-    for seed in range(4):
+    for seed in range(examples(4, quick=2)):
         asked = sample(seed)
         best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
         certified = decide(controller_of(asked[0], rules, name, certify=True), *asked[1:])

@@ -111,7 +111,7 @@ def within(rows, low, high, slack=0.0):
 
 
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
-@pytest.mark.parametrize("seed", seeds(200, quick=50))
+@pytest.mark.parametrize("seed", seeds(200, quick=25))
 def test_the_decision_is_the_optimum_found_by_an_independent_solver(seed):
     problem, sample = random_case(seed)
     decision = decide(problem, sample)
@@ -121,7 +121,7 @@ def test_the_decision_is_the_optimum_found_by_an_independent_solver(seed):
     np.testing.assert_allclose(decision.plan, plan, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", seeds(200, quick=50))
+@pytest.mark.parametrize("seed", seeds(200, quick=25))
 def test_a_decision_certifies_itself_and_keeps_its_limits(seed):
     problem, sample = random_case(seed)
     decision, limits = decide(problem, sample), problem.limits

@@ -18,7 +18,7 @@ from mampc import IOData, MampcError, StateSpace, n4sid, prbs, validate
 from mampc.identification.realisation import realise
 from mampc.identification.subspace import hankel_factor, observability
 from random_systems import markov, noise_free, noisy_record, random_system, system_with
-from seeds import examples
+from seeds import examples, seeds
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
 SIZES = [(2, 1, 1), (4, 2, 2), (5, 2, 3)]  # states, inputs, outputs
@@ -37,7 +37,7 @@ def assert_same_record(fitted, data):
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
 @pytest.mark.parametrize("feedthrough", [False, True])
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3, quick=1))
 def test_a_noise_free_record_gives_back_system_order_and_transient(seed, size, feedthrough, weighting):
     system = random_system(seed, *size, feedthrough)
     data = noise_free(system, seed)
@@ -83,7 +83,7 @@ def test_the_result_describes_the_record():
 
 
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4, quick=2))
 def test_units_decide_nothing(seed, weighting):
     """Every signal in a unit of its own: the same order, poles, fits, hold-out fits and initial state."""
     rng = np.random.default_rng(seed)
@@ -364,7 +364,7 @@ def tank_record(seed):
 
 
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3, quick=1))
 def test_the_order_of_the_tank_is_four(seed, weighting):
     fitted = n4sid(tank_record(seed), weighting=weighting)
     assert fitted.order == 4

@@ -6,6 +6,7 @@ from scipy import signal
 
 import mampc
 from builders import random_model
+from seeds import seeds
 
 
 def inverse_response(dt=0.25):
@@ -50,7 +51,7 @@ def test_without_a_tail_horizon_nothing_is_promised():
     assert np.isinf(mampc.largest_offset(problem, mampc.MoveRules(price=1.0)))
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", seeds(25, quick=10))
 def test_an_offset_that_stays_is_within_the_bound_of_its_price(seed):
     rng = np.random.default_rng(seed)
     model = random_model(seed, m=2, l=2, radius=rng.uniform(0.3, 0.8))

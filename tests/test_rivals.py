@@ -10,6 +10,7 @@ import pytest
 import mampc
 from builders import random_model, tank_model, tank_problem
 from mampc import rivals
+from seeds import seeds
 
 SIZE = (0.5, 2.0)  # of penalties, per input
 RULES = {
@@ -83,7 +84,7 @@ PENALTIES = {
 }
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4, quick=2))
 @pytest.mark.parametrize("name", PENALTIES)
 @pytest.mark.parametrize("on", ["moves", "inputs"])
 def test_convex_penalties_reach_the_optimum_of_an_independent_solver(name, on, seed):

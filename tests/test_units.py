@@ -5,7 +5,7 @@ import pytest
 
 import mampc
 from builders import random_model
-from seeds import examples
+from seeds import examples, seeds
 
 METHODS = {
     "mpc": None,
@@ -27,7 +27,7 @@ def scaled(model, u, y):
 @pytest.mark.parametrize("rules", [None, mampc.MoveRules(max_moves=3), mampc.MoveRules(price=0.5)], ids=str)
 def test_optima_are_the_same_in_small_and_large_units(rules, u, y):
     """One sample each of many problems with active limits."""
-    for seed in range(25):
+    for seed in range(examples(25, quick=8)):
         rng = np.random.default_rng(seed)
         usual = random_model(seed, n=3, m=2, l=2, radius=0.9)
         x, reference = rng.standard_normal(3), 3 * rng.standard_normal(2)
@@ -118,7 +118,7 @@ def test_with_the_default_weights_too_units_far_apart_are_controlled(name, u, y)
     assert (np.abs(outcome.y[-1] - outcome.r[-1]) < 0.05 * y).all()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", seeds(6, quick=3))
 def test_inputs_in_units_far_from_one_another_take_no_more_iterations(seed):
     """daqp by itself cycles there; and its answers depend on what it solved before."""
     rng = np.random.default_rng(seed)
@@ -221,7 +221,7 @@ def test_moves_and_words_are_the_same_whatever_the_units(method, rules):
     for seed in range(examples(4, quick=1)):
         for limited in (True, False):
             usual = decisions_in(np.ones(2), np.ones(2), seed, method, RULED[rules], limited)
-            for _ in range(2):
+            for _ in range(examples(2, quick=1)):
                 u, y = 1e3 ** rng.integers(-2, 3, 2).astype(float), 10.0 ** rng.uniform(-6, 6, 2)
                 other = decisions_in(u, y, seed, method, RULED[rules], limited)
                 for a, b in zip(usual, other, strict=True):
@@ -234,7 +234,7 @@ def test_moves_and_words_are_the_same_whatever_the_units(method, rules):
 @pytest.mark.parametrize("rules", RULED)
 def test_the_proven_optimum_has_the_same_moves_in_units_that_have_no_prefix(rules):
     rng = np.random.default_rng(1)
-    for seed in range(4):
+    for seed in range(examples(4, quick=2)):
         usual = decisions_in(np.ones(2), np.ones(2), seed, "exact", RULED[rules])
         u, y = 10.0 ** rng.uniform(-6, 6, 2), 10.0 ** rng.uniform(-6, 6, 2)
         for a, b in zip(usual, decisions_in(u, y, seed, "exact", RULED[rules]), strict=True):

@@ -67,7 +67,7 @@ def by_cvxpy(problem, x, low, high, pattern):
         return cp.Problem(cp.Minimize(cost), kept).solve(solver=cp.CLARABEL)
 
 
-@pytest.mark.parametrize("seed", [s for s in range(12) if s % 6 != 1])
+@pytest.mark.parametrize("seed", [s for s in range(6) if s % 6 != 1])
 def test_the_program_on_a_pattern_is_that_of_squared_distances(seed):
     problem, x, reference, rng = random_problem(seed)
     condensed, sample = sampled(problem, x, reference)
