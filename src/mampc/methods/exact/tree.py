@@ -36,6 +36,7 @@ from mampc.program.sample import Indices, Sample
 CHUNK = 256  # nodes treated at once; half as many where each has three children
 TOGETHER = 64  # leaves tried at once
 FIRST = 4  # of the nodes that spend their budget; the others are tried when their turn comes
+SEVERAL = 32  # nodes take longer than a relaxed program
 SHARE = 0.5  # of the time limit that one relaxed program may take
 WORTH = 0.01  # of the gap at the root: prices of moves that can be large close nothing
 
@@ -212,8 +213,8 @@ class _BatchSearch:
         return nodes._replace(bound=np.maximum(nodes.bound, value.max(axis=1) + nodes.charge))
 
     def _sharpened(self, level: int, nodes: Nodes) -> Nodes:
-        """The nodes bounded with the multipliers of the most promising one, where limits matter."""
-        if len(self._terms.ids) == 1 or not len(nodes.bound):
+        """The nodes bounded with the multipliers of the most promising one, where limits matter and it may pay."""
+        if len(self._terms.ids) == 1 or len(nodes.bound) < SEVERAL:
             return nodes
         domain, row = self._problem.domain, int(nodes.bound.argmin())
         undecided = np.arange(len(self._order)) >= level
