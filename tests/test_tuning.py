@@ -10,7 +10,7 @@ import mampc
 from builders import tank_model
 from mampc.cli import app
 from mampc.compare import scenarios, tuning
-from mampc.compare.scenarios import settling, usual_problem
+from mampc.compare.scenarios import even_weight, settling, usual_problem
 from mampc.compare.tuned_study import study_of_model, with_tuning
 from mampc.study import load_study, parse_study
 from mampc.study.running import regulator_of, run_study
@@ -236,6 +236,18 @@ def folder(tmp_path, monkeypatch):
 
 def command(*arguments):
     return CliRunner().invoke(app, ["tune", "--jobs", "1", *arguments])
+
+
+def test_outputs_of_a_model_file_weigh_alike_in_any_units():
+    """The command has no place for weights, and a mole fraction would not count beside a temperature."""
+    gain, units = np.array([[1.0, 0.5], [-0.3, 2.0]]), np.array([1e3, 1e-4])
+    weights = []
+    for unit in (np.ones(2), units):
+        model = mampc.StateSpace.from_first_order(
+            gain=gain * unit[:, None], time_constant=50.0, dead_time=0.0, dt=10.0
+        )
+        weights.append(even_weight(model, mampc.Limits(u_min=-1.0, u_max=1.0)) * unit**2)
+    np.testing.assert_allclose(weights[1] / weights[1][0], weights[0] / weights[0][0])
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,7 @@ def tune(
     folder = Path("results") / f"{Path(source).stem}-tuned" if out is None else out
     study = None
     if Path(source).suffix == ".json":
+        from mampc.compare.scenarios import even_weight
         from mampc.program.problem import Limits
         from mampc.systems.state_space import StateSpace
 
@@ -75,9 +76,8 @@ def tune(
                 "tune: expected --u-min and --u-max with a model file, received one or none of them"
             )
         model = StateSpace.load(source)
-        given: dict[str, Any] = {
-            "limits": Limits(u_min=_numbers("--u-min", u_min), u_max=_numbers("--u-max", u_max))
-        }
+        limits = Limits(u_min=_numbers("--u-min", u_min), u_max=_numbers("--u-max", u_max))
+        given: dict[str, Any] = {"limits": limits, "output_weight": even_weight(model, limits)}
     else:
         from mampc.study import load_study
 

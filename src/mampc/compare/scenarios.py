@@ -129,6 +129,13 @@ def usual_problem(model: StateSpace, limits: Limits, output_weight: Any) -> Trac
     return replace(problem, move_weight=curvature * n_c / CONDITION)
 
 
+def even_weight(model: StateSpace, limits: Limits) -> Array:
+    """Q of outputs whose errors count alike beside their noise, shape (l,), with 1 for one output or equal noises."""
+    noise = Surroundings.of(usual_problem(model, limits, 1.0), None, None, None).noise
+    weight: Array = (np.exp(np.log(noise).mean()) / noise) ** 2
+    return weight
+
+
 def settling(model: StateSpace) -> int:
     """Samples until every step response stays where it leads; of models that integrate, until its slope does."""
     response = model.step_response(LONGEST_SETTLING + 1)[:, :, : model.n_inputs]
