@@ -23,18 +23,17 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
-from mampc.base.tolerances import KEPT, SMALLER, tie
+from mampc.base.tolerances import tie
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
+from mampc.moves.courses import Courses, NextMoves, Past, past_of
 from mampc.moves.level_outputs import LimitedOutputs, ZonedOutputs
 from mampc.program.condensing import CondensedQP
-from mampc.program.levels import InputLevels, Timing
+from mampc.program.levels import InputLevels
 from mampc.program.sample import Indices, LeastSquares, Sample
 
-TOGETHER = 4096  # children of nodes that are treated at once
 BEAM = 32  # nodes of each move that the first plan is looked for among
 NEAREST = 5  # levels that it tries for each
 CACHE_BYTES = 64e6  # for the factors of recent patterns
-LONG_AGO = -1_000_000  # samples
 
 
 # The best moves where those of inputs with levels are given, shape (n_moves,), and what they cost; None for none.
@@ -69,43 +68,6 @@ class Factor(NamedTuple):
     missed: Array
 
 
-class Past(NamedTuple):
-    """What timings look back on: the sample of each input's last move (m,), and of starts so far, from -1 downwards."""
-
-    last: Indices
-    starts: tuple[Indices, ...]
-
-
-class Courses(NamedTuple):
-    """Nodes: courses decided up to some move; K of them.
-
-    Attributes:
-        d: moves decided, others zero, shape (K, n_moves).
-        u: inputs after them, shape (K, m).
-        rest: t - L d of each least-squares problem, shape (K, problems, k).
-        cost: squares of the rows decided, shape (K, problems).
-        charge, used: prices and moves of the budget so far, shape (K,).
-        now: moves at the sample that is being decided, shape (K,).
-        last: sample of each input's last move, shape (K, m).
-        excess: scaled violation of each output so far, shape (K, outputs).
-        bound: shape (K,).
-    """
-
-    d: Array
-    u: Array
-    rest: Array
-    cost: Array
-    charge: Array
-    used: Array
-    now: Array
-    last: Indices
-    excess: Array
-    bound: Array
-
-    def take(self, rows: Indices | BoolArray | slice) -> Courses:
-        return Courses._make([part[rows] for part in self])
-
-
 class LevelSearch:
     """The courses of inputs on levels of one problem.
 
@@ -128,20 +90,7 @@ class LevelSearch:
 
     def past(self, inputs: Array) -> Past:
         """What the applied inputs, shape (h, m) with the latest last, mean for timings."""
-        changes = np.diff(inputs, axis=0)[::-1]
-        moved = np.abs(changes) > KEPT * self.condensed.input_prefix
-        last = (
-            np.where(moved.any(axis=0), -1 - moved.argmax(axis=0), LONG_AGO)
-            if len(moved)
-            else np.full(inputs.shape[1], LONG_AGO)
-        )
-        starts = tuple(
-            np.zeros(0, dtype=np.intp)
-            if timing is None or timing.most is None
-            else -1 - np.flatnonzero(moved[:, a] & (changes[:, a] * (timing.on - timing.off) > 0))
-            for a, timing in enumerate(self.levels.timings)
-        )
-        return Past(last, starts)
+        return past_of(inputs, self.levels, self.condensed.input_prefix)
 
     def factor(self, pattern: BoolArray) -> Factor:
         """The cost in the moves of a pattern, shape (n_moves,)."""
@@ -211,20 +160,9 @@ class _OneSample:
         self._room = None if of.outputs is None else of.outputs.room(sample)
         self._best: Array | None = None
         self._objective, self._rounding = cutoff, condensed.rounding(sample)
-        shape = (admissible.control_horizon, m)
-        limits, bounds_now = condensed.problem.limits, sample.bounds_now
-        if bounds_now is None:
-            self._low, self._high = np.tile(limits.u_min, (shape[0], 1)), np.tile(limits.u_max, (shape[0], 1))
-        else:
-            self._low, self._high = bounds_now.low + sample.u_previous, bounds_now.high + sample.u_previous
-        kept = KEPT * condensed.input_prefix + 1e-14 * np.abs(sample.u_previous)
-        self._low, self._high = self._low - kept, self._high + kept
-        simple = slice(condensed.n_violations, condensed.bounds.n_simple)
-        most = sample.upper[simple] if condensed.bounds.every_move else np.full(condensed.n_moves, np.inf)
-        self._du_max, self._min_size = most + np.tile(kept, shape[0]), admissible.min_size
-        self._small = SMALLER * condensed.move_prefix
+        self._next = NextMoves(condensed, admissible, of.levels, sample, allowance, past)
         # Moves of inputs without levels are given by the pattern, and paid.
-        self._now = np.bincount(factor.free // m, minlength=shape[0])
+        self._now = np.bincount(factor.free // m, minlength=admissible.control_horizon)
         self._used = int((self._now > 0).sum()) if admissible.simultaneous else len(factor.free)
         self._charge = admissible.charge(np.isin(np.arange(condensed.n_moves), factor.free))
         self._few = admissible.priced or admissible.rules.max_moves is not None
@@ -242,7 +180,8 @@ class _OneSample:
         return self._objective - tie(self._objective, self._rounding)
 
     def run(self, deadline: float, most: float) -> Found:
-        pending, visited = [(0, self._root())], 0
+        root, visited = self._root(), 0
+        pending = [(0, root.take(root.bound < self._cutoff))]
         self._look_ahead(pending[0][1], deadline)
         while pending:
             if perf_counter() > deadline or visited > most:
@@ -265,11 +204,11 @@ class _OneSample:
     def _look_ahead(self, nodes: Courses, deadline: float) -> None:
         """A first plan, by the best few nodes of each move."""
         for step in range(len(self._steps)):
+            if not len(nodes.bound):
+                return
             nodes = self._children(step, nodes, NEAREST)[0]
             if len(nodes.bound) > BEAM:
                 nodes = nodes.take(np.argpartition(nodes.bound, BEAM)[:BEAM])
-            if not len(nodes.bound):
-                return
         self._finish(nodes, deadline)
 
     def _root(self) -> Courses:
@@ -304,14 +243,15 @@ class _OneSample:
         j, a = divmod(move, self._m)
         if step == 0 or self._steps[step - 1][0] // self._m != j:
             nodes = nodes._replace(now=np.full_like(nodes.now, self._now[j]))
-        u, low, high = nodes.u[:, a], self._low[j, a], self._high[j, a]
-        stays = np.flatnonzero((u >= low) & (u <= high))
+        u, stays = nodes.u[:, a], self._next.staying(j, a, nodes)
         rows: Indices = np.zeros(0, dtype=np.intp)
         values: Array = np.zeros(0)
         left = None
         if p >= 0:
-            may = self._may_move(j, a, nodes)
-            rows, values, first_left = self._levels_within(p, a, j, nodes, may, nearest)
+            pivot = self._factor.L[p, p]
+            room = np.sqrt(np.maximum(self._cutoff - nodes.cost[:, 0] - nodes.charge, 0.0)) / abs(pivot)
+            centre = u + nodes.rest[:, 0, p] / pivot
+            rows, values, first_left = self._next.levels_within(j, a, nodes, centre, room, nearest)
             if first_left < len(nodes.bound):
                 left, stays = nodes.take(slice(first_left, None)), stays[stays < first_left]
         children = nodes.take(np.concatenate([stays, rows]))
@@ -367,67 +307,6 @@ class _OneSample:
         if self._outputs is not None:
             best[:, 0] += self._outputs.penalty(nodes.excess)
         return nodes._replace(bound=np.maximum(nodes.bound, best.max(axis=1) + nodes.charge))
-
-    def _may_move(self, j: int, a: int, nodes: Courses) -> BoolArray:
-        """Which nodes may move input a at sample j."""
-        rules, allowance = self._rules, self._allowance
-        may: BoolArray = np.full(len(nodes.bound), j >= allowance.frozen[a])
-        if rules.per_step < self._m:
-            may &= nodes.now < rules.per_step
-        if rules.rules.max_moves is not None:
-            counted = 1 if not rules.simultaneous else (nodes.now == 0).astype(int)
-            may &= nodes.used + counted <= allowance.left
-        since = j - nodes.last[:, a]
-        if rules.rules.dwell > 1:
-            may &= (since >= rules.rules.dwell) | (nodes.last[:, a] < 0)
-        timing = self._of.levels.timings[a]
-        if timing is not None:
-            may &= self._is_due(timing, j, a, nodes, since)
-        return may
-
-    def _is_due(self, timing: Timing, j: int, a: int, nodes: Courses, since: Indices) -> BoolArray:
-        is_on = np.abs(nodes.u[:, a] - timing.on) < np.abs(nodes.u[:, a] - timing.off)
-        due: BoolArray = since >= np.where(is_on, timing.min_on, timing.min_off)
-        if timing.most is not None:
-            first = j - timing.window + 1
-            starts = np.count_nonzero(self._past.starts[a] >= first)
-            made = nodes.d[:, a :: self._m][:, max(first, 0) : j] * (timing.on - timing.off) > 0
-            due &= is_on | (starts + made.sum(axis=1) < timing.most)
-        return due
-
-    def _levels_within(
-        self, p: int, a: int, j: int, nodes: Courses, may: BoolArray, nearest: int | None
-    ) -> tuple[Indices, Array, int]:
-        """Nodes and levels that keep the row p within what the best plan leaves; the first node that has to wait."""
-        values, L, move = self._of.levels.values[a], self._factor.L[p, p], self._factor.moves[p]
-        assert values is not None
-        u, count = nodes.u[:, a], len(nodes.bound)
-        room = np.sqrt(np.maximum(self._cutoff - nodes.cost[:, 0] - nodes.charge, 0.0)) / abs(L)
-        centre = u + nodes.rest[:, 0, p] / L
-        least, most = (
-            np.searchsorted(values, self._low[j, a]),
-            np.searchsorted(values, self._high[j, a], side="right"),
-        )
-        first = np.clip(np.searchsorted(values, centre - room), least, most)
-        end = np.clip(np.searchsorted(values, centre + room, side="right"), first, most)
-        if nearest is not None:
-            at = np.searchsorted(values, centre)
-            first = np.minimum(np.maximum(first, np.minimum(at - nearest // 2 - 1, most - nearest)), end)
-            end = np.minimum(end, np.maximum(first, first + nearest))
-        counts = np.where(may, end - first, 0)
-        totals = np.cumsum(counts + 1)
-        waiting = (
-            count if nearest is not None else max(1, int(np.searchsorted(totals, TOGETHER, side="right")))
-        )
-        waiting = min(waiting, count)
-        counts = counts[:waiting]
-        rows = np.repeat(np.arange(waiting), counts)
-        offset = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        chosen = values[first[rows] + offset]
-        size = np.abs(chosen - u[rows])
-        kept = (size > self._small[move]) & (size <= self._du_max[move])
-        kept &= size >= self._min_size[move] - self._small[move]
-        return rows[kept], chosen[kept], waiting
 
     def _finish(self, courses: Courses, deadline: float) -> None:
         """Take the best of courses that are decided."""
