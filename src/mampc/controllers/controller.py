@@ -29,6 +29,7 @@ from mampc.program.sample import Indices, Sample
 from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
 
+WARM = 20  # moves from which on it saves time to start from the last active bounds
 ROUNDED = 1e-12  # relative to an input: what sums of moves may be off by
 
 
@@ -82,6 +83,7 @@ class Controller(ABC):
             constant.setflags(write=False)
         self._shape = (problem.control_horizon, model.n_inputs)
         self._memory = 1
+        self._warm = self.condensed.n_moves >= WARM
         self._x_shape = (model.n_states,)
         self._reference_shapes = ((model.n_outputs,), (problem.prediction_horizon + 1, model.n_outputs))
 
@@ -349,12 +351,16 @@ class Controller(ABC):
         margins = sample.margins
         if margins[margins.argmin()] > INSIDE:
             return Plan(sample.moves, Status.OPTIMAL, 0, None, None, sample.inputs, sample.cost)
-        nearest = self.condensed.plain.solve(sample.moves, sample.lower, sample.upper, state.active)
+        nearest = self.condensed.plain.nearest(
+            sample.target, sample.both_bounds, active=state.active if self._warm else None
+        )
         if nearest.moves is None or nearest.multipliers is None:
             return Plan(None, HELD_BY[nearest.status], nearest.iterations)
+        active = active_bounds(nearest.multipliers) if self._warm else None
+        violations = None if nearest.violated else self._no_violations
         return Plan(
-            nearest.moves, Status.OPTIMAL, nearest.iterations, None, None, None, sample.cost + nearest.excess, (),
-            active_bounds(nearest.multipliers), None, None if nearest.violated else self._no_violations,
+            nearest.moves, Status.OPTIMAL, nearest.iterations, None, None, None, sample.cost + nearest.excess,
+            active=active, violations=violations,
         )  # fmt: skip
 
     def _unrestricted_but_frozen(self, sample: Sample, frozen: Indices) -> Plan:

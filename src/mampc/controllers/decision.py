@@ -18,7 +18,7 @@ class ControllerState(NamedTuple):
         inputs: the inputs applied so far, oldest first, shape (h, m); the last row is u_{k-1}.
         samples: how many samples have been decided.
         guess: a method's starting point for the next sample, shape (nc, m), or None.
-        active: bounds that held the last plan of plain MPC, where the solver starts next, shape (n_bounds,), or
+        active: bounds that held the last plan of plain MPC with many moves, where the solver starts, (n_bounds,), or
             None. It is kept here and not in the solver so that equal states lead to equal decisions, to the bit.
         memory: what a rule of `mampc.rivals` remembers, one vector, or None.
     """

@@ -23,6 +23,7 @@ from mampc.program.refinement import refined
 
 SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
 UNCERTAIN = 1e-10  # of the excess: what a solver's slack may be worth before the solution is refined
+VIOLATED = 1e-18  # in the solver's units: a violation up to here is rounding
 DOUBTFUL = 1e4  # condition of R from which on the slack that a solver leaves is looked at
 
 
@@ -95,6 +96,7 @@ class LeastDistance:
         self.even = np.concatenate([1 / self._per_violation, even])
         self._f = np.concatenate([cost.linear * self._per_violation, np.zeros(k)])
         self._ordinary = bool(self._f.dot(self._f) <= ORDINARY**2)
+        self._of_scale: dict[float, tuple[Array, Array]] = {}
         self._nothing = np.zeros(v + len(A))
         self._nothing.setflags(write=False)
         self._solver = DaqpSolver(
@@ -107,28 +109,32 @@ class LeastDistance:
     def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
         """The best moves, given the optimum without limits, shape (k,), and all bounds, shape (v + b,)."""
         low, high = self.distances(optimum, lower, upper)
-        return self.solve_at(optimum, low, high, lower, upper, active)
+        return self.solve_at(optimum, np.concatenate((low, high)), np.concatenate((lower, upper)), active)
 
     def solve_at(
         self,
         optimum: Array,
-        low: Array,
-        high: Array,
-        lower: Array,
-        upper: Array,
+        distances: Array,
+        bounds: Array,
         active: Array | None = None,
         cutoff: float = np.inf,
     ) -> Nearest:
-        """The same where `distances` low and high are at hand; moves that cost no less than the cutoff are left out."""
+        """The same where the `distances` are at hand, lower ones and behind them upper ones, as the bounds stand too.
+
+        Moves that cost no less than the cutoff are left out.
+        """
+        v, limited, size = self._v, self._limited, len(self.even)
+        low, high = distances[:size], distances[size:]
         far = self._far(low, high)
         if far <= 0:
             return Nearest(optimum, 0.0, self._nothing, QPStatus.OPTIMAL, 0)
-        f, v, scale = self._f, self._v, 1.0
-        limited = self._limited
+        scale, f, even = 1.0, self._f, self.even
         # Violations of limits have a size of their own, 1: nothing smaller is enlarged then.
         if far > (1.0 if limited else 0.0) and isfinite(far):
             scale = float(2.0 ** frexp(far)[1])
-            f, low, high = f / scale, low / scale, high / scale
+            f, even = self._scaled(scale)
+            scaled = distances / scale
+            low, high = scaled[:size], scaled[size:]
         if self._ordinary:
             solution = self._solver.solve_anew(f, low, high, active)
         else:
@@ -137,25 +143,32 @@ class LeastDistance:
         z, pull, status, iterations = solution
         if z is None or pull is None:
             if status in (QPStatus.INFEASIBLE, QPStatus.FAILED, QPStatus.ITERATION_LIMIT):
-                return self._tried_again(optimum, lower, upper, solution)
+                return self._tried_again(optimum, bounds[:size], bounds[size:], solution)
             return Nearest(None, np.inf, None, status, iterations)
         delta = z[v:] * scale
-        excess, violated = float(delta.dot(delta)), limited > 0 and max(z[:limited].tolist()) > 0
+        excess, violated = float(delta.dot(delta)), limited > 0 and max(z[:limited].tolist()) > VIOLATED
         if violated or v > limited:
             excess += self._cost.of(z[:v] * (scale * self._per_violation))
-        multipliers = pull * (scale * self.even)
+        multipliers = pull * even
         if self._doubtful:
             slack = np.where(pull > 0, high, low)[v:] - self._A.dot(z)
             if scale * scale * np.abs(pull[v:]).dot(np.abs(slack)) > UNCERTAIN * excess:
-                return self._refined(optimum, lower, upper, multipliers, iterations)
+                return self._refined(optimum, bounds[:size], bounds[size:], multipliers, iterations)
         if excess >= cutoff:
             return Nearest(None, excess, multipliers, status, iterations, violated)
         moves = self._inverse.dot(delta)
         moves += optimum
         for i, force in enumerate(pull[v : v + self._n_simple].tolist()):
             if force:
-                moves[i] = (upper if force > 0 else lower)[v + i]
+                moves[i] = bounds[v + i + size if force > 0 else v + i]
         return Nearest(moves, excess, multipliers, status, iterations, violated)
+
+    def _scaled(self, scale: float) -> tuple[Array, Array]:
+        """The linear term of all lengths divided by a power of two, and what its multipliers are multiplied by."""
+        kept = self._of_scale.get(scale)
+        if kept is None:
+            kept = self._of_scale[scale] = self._f / scale, scale * self.even
+        return kept
 
     @cached_property
     def _doubtful(self) -> bool:

@@ -90,21 +90,24 @@ class Restriction:
             active = active[self.bounds]
         return self._of_all_bounds(self.program.solve(optimum, lower, upper, active))
 
-    def nearest(self, target: Array, bounds: Array, cutoff: float = np.inf) -> Nearest:
+    def nearest(
+        self, target: Array, bounds: Array, cutoff: float = np.inf, active: Array | None = None
+    ) -> Nearest:
         """The best moves within limits, if they cost less than the cutoff, with what they cost more than all moves do.
 
         Args:
             target: of the sample.
             bounds: all lower bounds, and behind them all upper ones, shape (2 n_bounds,).
+            active: as `solve` takes it.
         """
-        k, kept = len(self.moves), len(self.bounds)
+        k = len(self.moves)
         of_target, which, even = self._of_sample
         values, given = of_target.dot(target), bounds.take(which)
         missed, distances = values[k : len(target)], given * even
         distances -= values[len(target) :]
         excess = float(missed.dot(missed))
         nearest = self.program.solve_at(
-            values[:k], distances[:kept], distances[kept:], given[:kept], given[kept:], cutoff=cutoff - excess
+            values[:k], distances, given, None if active is None else active[self.bounds], cutoff - excess
         )
         return self._of_all_bounds(nearest, excess)
 
