@@ -17,6 +17,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 from builders import load_bank
+from mampc import KalmanFilter
 from mampc.program.daqp import DaqpSolver
 from mampc.program.qp import UNBOUNDED, QPStatus
 from mampc.report import output
@@ -115,9 +116,12 @@ def pytest_terminal_summary(terminalreporter):
 
 @pytest.fixture(params=["kalman filter", "load bank"])
 def either_estimator(request, monkeypatch):
-    """Runs a test with each estimator as the default one of regulators."""
-    if request.param == "load bank":
-        monkeypatch.setattr("mampc.loop.regulator.default_estimator", load_bank)
+    """Runs a test with each estimator as the default one of all regulators."""
+    estimators = {
+        "kalman filter": lambda controller: KalmanFilter.offset_free(controller.problem.model),
+        "load bank": lambda controller: load_bank(controller.problem),
+    }
+    monkeypatch.setattr("mampc.loop.regulator.default_estimator", estimators[request.param])
     return request.param
 
 

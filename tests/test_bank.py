@@ -9,6 +9,7 @@ from mampc.study import parse_study, run_study, template
 
 TANK = mampc.plants.QuadrupleTank()
 PRICES = {"calm": 2.0, "brisk": 0.05}
+ESTIMATOR = mampc.KalmanFilter.offset_free(identified_tank())  # of a variant and of its controller alone
 
 
 def variants(model=None):
@@ -30,14 +31,16 @@ def switched(steps=60):
 
 
 def run(**settings):
-    regulator = mampc.Regulator(mampc.ControllerBank(variants()))
+    regulator = mampc.Regulator(mampc.ControllerBank(variants()), ESTIMATOR)
     return regulator, mampc.simulate(TANK, regulator, reference(), noise=0.1, progress=False, **settings)
 
 
 @pytest.mark.parametrize("name", ["calm", "brisk", "plain"])
 def test_a_variant_decides_as_its_controller_alone(name):
     _, ours = run(variant=name)
-    alone = mampc.simulate(TANK, mampc.Regulator(variants()[name]), reference(), noise=0.1, progress=False)
+    alone = mampc.simulate(
+        TANK, mampc.Regulator(variants()[name], ESTIMATOR), reference(), noise=0.1, progress=False
+    )
     np.testing.assert_array_equal(ours.u, alone.u)
     assert {decision.variant for decision in ours.decisions} == {name}
 

@@ -98,6 +98,11 @@ class MAMPC(Controller):
             if (size > most).any():
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether no rule binds, so that this is plain MPC."""
+        return self._search is None
+
     def with_information(self, shifts: Array, *, price_follows_noise: bool = False) -> MAMPC:
         """This controller with plans that count on later data; `shifts` as `Information` takes them.
 

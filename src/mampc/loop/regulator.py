@@ -22,13 +22,14 @@ from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.controllers.mampc import MAMPC
 from mampc.loop.actuators import LATEST, Actuators
-from mampc.loop.estimation import Estimate, Estimator, KalmanFilter
+from mampc.loop.defaults import default_estimator
+from mampc.loop.estimation import Estimate, Estimator
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.sensors import Judged, SensorChecks, SensorState
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Compensation, Valves
 from mampc.program.daqp import active_flags
-from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.problem import Limits
 from mampc.systems.state_space import StateSpace
 
 USUAL_CHECKS = SensorChecks()
@@ -39,12 +40,14 @@ class Regulator:
 
     Args:
         controller: `MPC` or `MAMPC`.
-        estimator: default `KalmanFilter.offset_free` of the controller's model; or a `LoadBank`.
+        estimator: default a `LoadBank` where moves are priced or bounded by another method than the paper's, and
+            `KalmanFilter.offset_free` of the controller's model elsewhere (`loop.defaults` says it all).
         sensors: when a measurement is believed; default `SensorChecks()`.
         max_blind_steps: samples in a row that inputs are still planned, on predictions, though no output at
             all is believed; from then on they are held until one is. 0 holds at once.
         value_of_information: plan with what later measurements will tell (see docs/how-it-decides.md): needs `MAMPC`
-            and an estimator that knows the noise in output units, a `LoadBank`.
+            and an estimator that knows the noise in output units, a `LoadBank`. Objectives of decisions hold it
+            then, and what `largest_offset` promises does not.
         price_follows_noise: the price is for the noise that the estimator was told, and is scaled by the variance of
             what it finds; for noise that was guessed. Needs `value_of_information` and an exact search by a table.
         applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
@@ -90,7 +93,7 @@ class Regulator:
         self.controller = controller
         self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
         self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
-        self.estimator = default_estimator(controller.problem) if estimator is None else estimator
+        self.estimator = default_estimator(controller) if estimator is None else estimator
         self.sensors = USUAL_CHECKS if sensors is None else sensors
         self._sensors = self.sensors.fitted(controller.problem)
         self._v_shape = (model.n_disturbances,)
@@ -122,7 +125,8 @@ class Regulator:
             self._planner = _with_information(self._planner, self.estimator, self.price_follows_noise)
 
     def __repr__(self) -> str:
-        return f"Regulator({type(self.controller).__name__}, {self.estimator!r})"
+        counts = ", value_of_information=True" if self.value_of_information else ""
+        return f"Regulator({type(self.controller).__name__}, {self.estimator!r}{counts})"
 
     def initial_state(
         self, u_previous: Any = None, y: Any = None, measured_disturbance: Any = None
@@ -363,11 +367,6 @@ def _with_information(planner: Controller, estimator: Estimator, price_follows_n
             f"received {type(estimator).__name__}"
         )
     return planner.with_information(shifts, price_follows_noise=price_follows_noise)
-
-
-def default_estimator(problem: TrackingProblem) -> Estimator:
-    """What a regulator estimates with unless told otherwise."""
-    return KalmanFilter.offset_free(problem.model)
 
 
 def _where_usable(reported: Array, otherwise: Array) -> Array:

@@ -50,6 +50,7 @@ def summarise(result: StudyResult) -> dict[str, Any]:
 def _controller(run: Run, study: Study, ratings: Ratings) -> dict[str, Any]:
     microseconds = run.solve_times * 1e6
     return {
+        "estimator": "load_bank" if run.decisions and run.decisions[0].load is not None else "kalman_filter",
         **_metrics(run, study.threshold, 0, ratings),
         "without_transient": {"skipped": study.skip, **_metrics(run, study.threshold, study.skip, ratings)},
         "solve_time_us": {

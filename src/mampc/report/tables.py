@@ -48,6 +48,8 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
         title=escape(f"{study.name}, {scenario['name']} — {samples}"),
         title_justify="left",
         title_style="bold",
+        caption=_estimators(scenario),
+        caption_justify="left",
     )
     published = any(_published(controller, part) for controller in study.controllers)
     table.add_column("controller", no_wrap=True)
@@ -83,6 +85,16 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
             row += _published_cells(_published(controller, part), _published(base, part))
         table.add_row(*row, f"{times[controller.name]:.0f}")
     return table
+
+
+def _estimators(scenario: dict[str, Any]) -> str | None:
+    """Who estimates with a load bank; None where all have a Kalman filter."""
+    banks = [entry["name"] for entry in scenario["controllers"] if entry["estimator"] == "load_bank"]
+    if not banks:
+        return None
+    if len(banks) == len(scenario["controllers"]):
+        return "All have a load bank."
+    return escape(f"With a load bank: {', '.join(banks)}; the others have a Kalman filter.")
 
 
 def _wear_table(study: Study, scenario: dict[str, Any]) -> Table:

@@ -15,6 +15,7 @@ from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.loop.batch import Batch, simulate_batch
+from mampc.loop.defaults import default_estimator
 from mampc.loop.estimation import Estimator, KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.loads import Load, Residuals
@@ -31,7 +32,7 @@ from mampc.rivals.registry import RIVALS, rival
 from mampc.study.cautions import cautions
 from mampc.study.plugins import make_plant
 from mampc.study.scenario_tables import LoadTable, ScenarioTable
-from mampc.study.schema import BANK, ControllerTable, IdentificationTable, Study
+from mampc.study.schema import BANK, ControllerTable, EstimatorTable, IdentificationTable, Study
 from mampc.study.values import Values
 from mampc.study.wear import ratings_of
 from mampc.systems.mismatch import Mismatch
@@ -140,12 +141,14 @@ def prepare(
 def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
     """The regulator that a study's tables describe."""
     problem = _problem(study, model)
-    estimator, valves = _estimator(study, problem), None
+    valves = None
     if table.compensate and study.actuators is not None:
         valves = study.actuators.valves()
         table = _executed(table, valves, model.n_inputs)
     controller = _controller(problem, table, study.controllers)
-    counts = study.estimator.value_of_information and any(type(one) is MAMPC for one in controller.each)
+    estimator = _estimator(study.estimator, controller)
+    counts = study.estimator.value_of_information and isinstance(estimator, LoadBank)
+    counts = counts and any(type(one) is MAMPC for one in controller.each)
     smooth = None if table.reference_filter is None else table.reference_filter.made()
     try:
         return Regulator(
@@ -354,15 +357,17 @@ def _sparse(problem: TrackingProblem, table: ControllerTable, method: str, setti
     )  # fmt: skip
 
 
-def _estimator(study: Study, problem: TrackingProblem) -> Estimator:
-    table = study.estimator
+def _estimator(table: EstimatorTable, controller: Controller) -> Estimator:
+    problem = controller.problem
     try:
         if table.kind == "load_bank":
             if table.price_follows_noise and table.measurement_noise is not None:
                 return LoadBank(problem.model, noise=table.measurement_noise, guessed=True)
             return LoadBank.for_problem(problem, noise=table.measurement_noise)
-        settings = table.model_dump(exclude={"kind", "value_of_information", "price_follows_noise"})
-        return KalmanFilter.offset_free(problem.model, **settings)
+        if table.is_kalman_filter:
+            told = table.model_dump(include={"disturbance", "measurement_noise", "drift", "input_noise"})
+            return KalmanFilter.offset_free(problem.model, **told)
+        return default_estimator(controller, table.measurement_noise)
     except MampcError as error:
         raise StudyError(f"[estimator] {error}") from None
 

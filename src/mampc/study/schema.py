@@ -260,7 +260,9 @@ class ControllerTable(Table):
 
 
 class EstimatorTable(Table):
-    kind: Literal["kalman_filter", "load_bank"] = "kalman_filter"
+    kind: Literal["usual", "kalman_filter", "load_bank"] = (
+        "usual"  # usual: what each controller has by default
+    )
     value_of_information: bool = False
     price_follows_noise: bool = False
     disturbance: Literal["auto", "output", "input"] = "auto"
@@ -276,11 +278,17 @@ class EstimatorTable(Table):
                 raise ValueError(
                     f"neither disturbance, drift nor input_noise for a load_bank; received {', '.join(sorted(other))}"
                 )
-        elif self.value_of_information:
+        elif self.value_of_information and self.is_kalman_filter:
             raise ValueError('value_of_information with kind = "load_bank" only, which knows the noise')
         if self.price_follows_noise and not self.value_of_information:
             raise ValueError("value_of_information beside price_follows_noise")
         return self
+
+    @property
+    def is_kalman_filter(self) -> bool:
+        """Whether it is one for all controllers: it says so, or says what only a Kalman filter is told."""
+        told = self.disturbance != "auto" or self.drift is not None or self.input_noise is not None
+        return self.kind == "kalman_filter" or told
 
 
 class SensorsTable(Table):

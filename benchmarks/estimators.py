@@ -1,0 +1,86 @@
+"""What regulators need by estimator alone: moves at 1.25 times plain MPC's error, beside those with a Kalman filter.
+
+    python benchmarks/estimators.py [--plants tank level]
+
+The plants and loads of the attention benchmark with fewer scenarios. The exact price, at seven prices, estimates with a
+Kalman filter as it comes, with a load bank that knows the noise, and with one that guesses it from limits; both banks
+without and with later data. Nothing is tuned: with the settings of plain MPC, and with a tail and light moves.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+import mampc
+from attention_cases import Case, cases, load_of, problem_of, reference_of
+from mampc.compare.fronts import Point, moves_at
+
+LOADS = ("none", "steps", "wandering", "sinusoidal")
+PRICES, SEEDS, RATIO = 100 * np.geomspace(1 / 30, 30, 7), range(2000, 2003), 1.25
+SETTINGS = {"as plain MPC": {}, "tail, light moves": {"lighter": 0.1, "tail": 20.0}}
+ESTIMATORS = ("Kalman filter", "bank", "bank, later data", "guessing bank", "guessing bank, later data")
+
+
+def regulators(case: Case, problem: mampc.TrackingProblem, name: str) -> list[mampc.Regulator]:
+    """One at each price."""
+    if name == "Kalman filter":
+        estimator: object = mampc.KalmanFilter.offset_free(case.model)
+    else:
+        noise = None if name.startswith("guessing") else case.noise
+        estimator = mampc.LoadBank.for_problem(problem, noise=noise)
+    later = name.endswith("later data")
+    return [
+        mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(price=p)), estimator, value_of_information=later)
+        for p in PRICES
+    ]
+
+
+def points(case: Case, load: str, made: list[mampc.Regulator], name: str) -> list[Point]:
+    """Moves and errors of each regulator in the same scenarios."""
+    batch = mampc.simulate_batch(
+        case.plant, [own for own in made for _ in SEEDS], reference_of(case), seeds=[*SEEDS] * len(made),
+        noise=case.noise, loads=load_of(load, case), progress=False,
+    )  # fmt: skip
+    moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2)).reshape(-1, len(SEEDS))
+    error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2)).reshape(-1, len(SEEDS))
+    return [
+        Point(name, float(k), m.astype(float), e)
+        for k, (m, e) in enumerate(zip(moves, error, strict=True), 1)
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--plants", nargs="*", default=[*cases()], help="only these")
+    ratios: dict[str, list[list[float]]] = {setting: [] for setting in SETTINGS}
+    for name in parser.parse_args().plants:
+        case = cases()[name]
+        for load in LOADS:
+            plain = problem_of(case)
+            filtered = mampc.KalmanFilter.offset_free(
+                case.model, measurement_noise=case.noise, drift=0.3 * case.noise
+            )
+            (base,) = points(case, load, [mampc.Regulator(mampc.MPC(plain), filtered)], "MPC")
+            for setting, settings in SETTINGS.items():
+                problem = problem_of(case, moves=3, **settings)
+                found = [
+                    moves_at(points(case, load, regulators(case, problem, each), each), base, RATIO).value
+                    for each in ESTIMATORS
+                ]
+                ratios[setting].append([value / found[0] for value in found])
+                told = ", ".join(
+                    f"{100 * value:.1f} {each}" for value, each in zip(found, ESTIMATORS, strict=True)
+                )
+                print(f"{name}, {load}, {setting}, percent of plain MPC's moves: {told}", flush=True)
+    for setting, rows in ratios.items():
+        means = np.exp(np.nanmean(np.log(rows), axis=0))
+        told = ", ".join(f"{mean:.2f} {each}" for mean, each in zip(means, ESTIMATORS, strict=True))
+        print(f"{setting}, moves over those with a Kalman filter, geometric mean: {told}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""What a regulator estimates with unless it is told.
+
+Where moves cost something or are few, each one made for noise, or late for a load, counts: there a `LoadBank` makes the
+better use of them. Plain MPC moves at every sample anyway, a rule around it is what one would use instead, and the
+paper's method stays as it is published: these have a `KalmanFilter`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mampc.base.errors import MampcError
+from mampc.controllers.controller import Controller
+from mampc.controllers.mampc import MAMPC
+from mampc.loop.estimation import Estimator, KalmanFilter
+from mampc.loop.load_bank import LoadBank
+from mampc.methods.alternating import Alternating
+
+
+def has_scarce_moves(controller: Controller) -> bool:
+    """Whether a controller, or each of its variants, prices or bounds moves by another method than the paper's."""
+    return all(
+        type(one) is MAMPC and not one.is_plain and not isinstance(one.method, Alternating)
+        for one in controller.each
+    )
+
+
+def default_estimator(controller: Controller, noise: Any = None) -> Estimator:
+    """What a regulator estimates with unless told otherwise.
+
+    A `LoadBank` where `has_scarce_moves` and there are sizes of the noise: `noise`, the model's own, or a guess from
+    limits of all inputs. Else, or where the model's numbers allow no bank, `KalmanFilter.offset_free`.
+
+    Args:
+        controller: of the regulator.
+        noise: standard deviation of the measurement noise of each output, scalar or (l,), where it is known.
+    """
+    if has_scarce_moves(controller):
+        try:
+            return LoadBank.for_problem(controller.problem, noise=noise)
+        except MampcError:
+            pass
+    return KalmanFilter.offset_free(controller.problem.model, measurement_noise=noise)

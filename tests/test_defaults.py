@@ -1,0 +1,83 @@
+"""Who estimates with what, unless told: the same in a regulator and in a study."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import identified_tank, tank_problem
+from mampc import KalmanFilter, LoadBank, MoveRules
+from mampc.study import parse_study, template
+from mampc.study.running import regulator_of
+
+PRICE = MoveRules(price=1.0)
+SPARSE = {
+    "price": PRICE, "budget": MoveRules(max_moves=2, sparsity_horizon=3), "dwell": MoveRules(dwell=3),
+    "least size": MoveRules(min_size=1.0),
+}  # fmt: skip
+
+
+def estimator(controller):
+    return mampc.Regulator(controller).estimator
+
+
+@pytest.mark.parametrize("rules", SPARSE)
+def test_where_moves_are_priced_or_bounded_there_is_a_load_bank(rules):
+    model = identified_tank()
+    bank = estimator(mampc.MAMPC(tank_problem(model), SPARSE[rules]))
+    assert isinstance(bank, LoadBank)
+    np.testing.assert_array_equal(bank.noise, model.noise.output)  # as its record showed
+
+
+def test_plain_mpc_rules_that_bind_nothing_rivals_and_the_paper_have_a_kalman_filter():
+    problem = tank_problem(identified_tank())
+    mpc, price = mampc.MPC(problem), mampc.MAMPC(problem, PRICE)
+    controllers = [
+        mpc, mampc.MAMPC(problem, MoveRules()), mampc.rivals.DeadBand(mpc, size=1.0),
+        mampc.rivals.DeadBand(price, size=1.0), mampc.ControllerBank({"price": price, "plain": mpc}),
+        *(mampc.MAMPC(problem, SPARSE["budget"], method="alternating", polish=polish) for polish in (False, True)),
+    ]  # fmt: skip
+    for controller in controllers:
+        assert isinstance(estimator(controller), KalmanFilter)
+    assert isinstance(estimator(mampc.ControllerBank({"a": price, "b": price})), LoadBank)
+
+
+def test_noise_that_nobody_told_is_guessed_from_limits_or_there_is_a_kalman_filter():
+    model = replace(identified_tank(), noise=None)
+    bank = estimator(mampc.MAMPC(tank_problem(model), PRICE))
+    np.testing.assert_array_equal(bank.noise, LoadBank.for_problem(tank_problem(model)).noise)
+    unlimited = tank_problem(model, limits=mampc.Limits())
+    assert isinstance(estimator(mampc.MAMPC(unlimited, PRICE)), KalmanFilter)
+
+
+def test_a_regulator_says_what_it_estimates_with():
+    problem = tank_problem(identified_tank())
+    assert "KalmanFilter" in repr(mampc.Regulator(mampc.MPC(problem)))
+    sparse = mampc.MAMPC(problem, PRICE)
+    assert "LoadBank" in repr(mampc.Regulator(sparse))
+    assert "value_of_information" in repr(mampc.Regulator(sparse, value_of_information=True))
+
+
+@pytest.mark.parametrize(
+    ("table", "of_mpc", "of_price"),
+    [
+        ("", KalmanFilter, LoadBank),
+        ("measurement_noise = 0.2", KalmanFilter, LoadBank),
+        ('kind = "load_bank"', LoadBank, LoadBank),
+        ('kind = "kalman_filter"', KalmanFilter, KalmanFilter),
+        ("drift = 0.1", KalmanFilter, KalmanFilter),
+        ("value_of_information = true", KalmanFilter, LoadBank),
+    ],
+)
+def test_a_study_has_the_same_defaults(table, of_mpc, of_price):
+    text = template()
+    start, end = text.index("[estimator]"), text.index("[sensors]")
+    study = parse_study(f"{text[:start]}[estimator]\n{table}\n{text[end:]}")
+    model = identified_tank()
+    made = {one.name: regulator_of(study, model, one) for one in study.controllers}
+    for name, kind in (("MPC", of_mpc), ("MAMPC ns=3", of_mpc), ("exact price", of_price)):
+        assert isinstance(made[name].estimator, kind)
+        assert made[name].value_of_information == ("value" in table and name == "exact price")
+    if "noise" in table:
+        np.testing.assert_array_equal(made["exact price"].estimator.noise, [0.2, 0.2])
