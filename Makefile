@@ -13,6 +13,9 @@ export OMP_NUM_THREADS := 1
 # Compiled modules are kept, or every process of the tests compiles them again.
 unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
+# A file of deep tests is run again when it or the package has changed; `make deep -k` goes on past a file that fails.
+SOURCES := $(shell find src -name '*.py') $(filter-out tests/test_%,$(wildcard tests/*.py))
+DEEP := $(patsubst tests/%.py,.deep/%.stamp,$(wildcard tests/test_*.py))
 
 .PHONY: demo test deep coverage fuzz lint format bench conditioning methods attention figures lock clean help
 .DEFAULT_GOAL := help
@@ -26,8 +29,12 @@ demo: .venv/run.stamp  ## run the quadruple-tank study: a table, results/quadrup
 test: .venv/dev.stamp  ## run the tests
 	$(PYTEST) $(PYTEST_ARGS)
 
-deep: .venv/dev.stamp  ## run all tests, with every seed and example
-	MAMPC_DEEP=1 $(PYTEST) -m "" $(PYTEST_ARGS)
+deep: $(DEEP)  ## run all tests with every seed and example, file by file; goes on where it stopped
+
+.deep/%.stamp: tests/%.py $(SOURCES) | .venv/dev.stamp
+	@mkdir -p .deep
+	MAMPC_DEEP=1 $(PYTEST) -m "" $(PYTEST_ARGS) $<
+	@touch $@
 
 coverage: .venv/dev.stamp  ## run the tests and show which branches none of them takes
 	$(PYTEST) --cov --cov-report=term-missing:skip-covered $(PYTEST_ARGS)
@@ -66,7 +73,7 @@ lock: .venv/dev.stamp  ## pin the versions that tests and demo use
 	rm -f uv.lock
 
 clean:  ## remove environments and caches
-	rm -rf .venv .uv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .uv .deep .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 
 .venv/pyvenv.cfg:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
