@@ -7,6 +7,7 @@ import mampc
 from mampc import IOData, n4sid, prbs
 from mampc.identification.closed_loop import under_feedback
 from mampc.identification.scaling import scaled
+from seeds import examples
 
 PLANTS = {  # A, B, C and a feedback that stabilises them
     "one pole": ([[1.05]], [[0.5]], [[1.0]], [[0.4]]),
@@ -40,7 +41,7 @@ def record_of(name, seed, *, noise=0.05, samples=2000, units=(1.0, 1.0)):
 @pytest.mark.parametrize("name", ["one pole", "with a lag", "two outputs"])
 def test_unstable_poles_are_kept_where_the_record_shows_them(name, noise, units):
     A, B, C, _ = map(np.array, PLANTS[name])
-    for seed in range(2):
+    for seed in range(examples(2, quick=1)):
         fitted = n4sid(record_of(name, seed, noise=noise, units=units), feedthrough=False)
         assert not fitted.stabilised
         assert np.abs(fitted.model.poles()).max() == pytest.approx(np.max(np.diag(A)), abs=0.01)

@@ -7,6 +7,7 @@ import mampc
 from mampc import IOData, StateSpace, n4sid, prbs
 from mampc.study.own import draft
 from mampc.systems.properties import properties
+from seeds import examples
 
 
 def plant_with(poles, seed=0):
@@ -35,7 +36,7 @@ def record_of(plant, seed, *, samples=1500, noise=0.05, off=0.2, units=(1.0, 1.0
 @pytest.mark.parametrize("noise", [0.0, 0.02, 0.1])
 @pytest.mark.parametrize("poles", [(1.0,), (1.0, 1.0), (1.0, 0.9)])
 def test_integrators_are_integrators(poles, noise, units):
-    for seed in range(2):
+    for seed in range(examples(2, quick=1)):
         fitted = n4sid(record_of(plant_with(poles), seed, noise=noise, units=units), feedthrough=False)
         assert fitted.integrators == poles.count(1.0)
         model, q = fitted.model, fitted.integrators
@@ -49,7 +50,7 @@ def test_integrators_are_integrators(poles, noise, units):
 @pytest.mark.parametrize("noise", [0.02, 0.1])
 @pytest.mark.parametrize("poles", [(0.98,), (0.995,), (0.998,), (0.98, 0.995)])
 def test_slow_poles_that_a_record_shows_to_decay_are_no_integrators(poles, noise):
-    for seed in range(2):
+    for seed in range(examples(2, quick=1)):
         fitted = n4sid(record_of(plant_with(poles), seed, noise=noise), feedthrough=False)
         assert fitted.integrators == 0
         slowest = np.sort(fitted.model.poles().real)[-len(poles) :]
@@ -72,7 +73,7 @@ def test_the_model_rests_where_the_plant_rests(poles):
 @pytest.mark.parametrize("units", [(1.0, 1.0), (1e-4, 1e5)])
 @pytest.mark.parametrize("poles", [(1.0, 0.9), (0.95, 1.0, 0.8)])
 def test_no_level_leaks_into_outputs_that_settle(poles, units):
-    for seed in range(3):
+    for seed in range(examples(3, quick=1)):
         model = n4sid(record_of(plant_with(poles, seed), seed, units=units), feedthrough=False).model
         settles = np.array(poles) < 1
         assert (model.C[settles, 0] == 0).all()

@@ -57,9 +57,11 @@ def test_gains_are_those_that_a_kalman_filter_settles_at(name, hypothesis):
     loads = Loads.of(model, np.linspace(0.1, 0.3, model.n_outputs))
     member = Member(hypothesis, loads)
     A, C, Q, R = member.A, member.C, driven(hypothesis, loads), member.noise
-    P = Q.copy()
+    P, K = Q.copy(), np.zeros((len(A), len(C)))
     for _ in range(3000):  # in the form of Joseph, which keeps it positive
-        K = np.linalg.solve(C @ P @ C.T + R, C @ P).T
+        before, K = K, np.linalg.solve(C @ P @ C.T + R, C @ P).T
+        if np.allclose(K, before, rtol=0, atol=1e-13 * np.abs(K).max()):
+            break
         rest = np.eye(len(A)) - K @ C
         P = A @ (rest @ P @ rest.T + K @ R @ K.T) @ A.T + Q
         P = (P + P.T) / 2

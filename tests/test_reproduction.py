@@ -1,11 +1,13 @@
 """The page that puts the paper's results beside ours, and the sensitivity runs behind it."""
 
 import re
+from itertools import islice
 
 import pytest
 
 from mampc.compare.sensitivity import Point, holding, sensitivity, varied
-from mampc.report import reproduction
+from mampc.report import output, reproduction
+from mampc.report.figures import study_figures
 from mampc.report.page import Page
 from mampc.study import load_study, parse_study, template
 from mampc.study.running import prepare, regulator_of, run_controller
@@ -17,6 +19,8 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page") / "out"
     patch = pytest.MonkeyPatch()
     patch.setattr(reproduction, "CASES", {"quadruple-tank": {"penalty": [1.0, 10.0], "noise": [0.1]}})
+    patch.setattr(reproduction, "study_figures", lambda result: islice(study_figures(result), 2))
+    patch.setattr(output, "FIGURE_KINDS", ("svg",))
     cases = reproduction.reproduce(folder)
     patch.undo()
     return folder, cases
