@@ -43,6 +43,8 @@ def main() -> None:
     for name, figure in export_figures().items():
         save(name, figure)
     result = run_study(load_study("quadruple-tank"), print)
+    save("ranks", ranks_figure())
+    save("resting-values", targets_figure())
     save("move-pattern", pattern_figure(result))
     for drawing in study_figures(result):
         if drawing.name in SHOWN:
@@ -84,6 +86,55 @@ def example_figures():
             legend_above(figure)
         figures[name] = figure
     return figures
+
+
+def dashed(panel, run, output):
+    """The reference of an output over minutes."""
+    look = {"color": BLACK, "linestyle": "--", "linewidth": 0.9, "label": "reference"}
+    panel.step(run.t / 60, run.r[:, output], where="post", **look)
+
+
+def ranks_figure():
+    """Both levels of `examples/ranks.toml` with their limits, without and with ranks."""
+    study = load_study(EXAMPLES / "ranks.toml")
+    unranked = study.model_copy(update={"problem": study.problem.model_copy(update={"output_rank": None})})
+    limits = (study.problem.limits.y_min[0], study.problem.limits.y_max[1])
+    shown = (("no ranks", unranked), ("second level first", study))
+    with styled():
+        figure, axes = new_figure(2, 2, sharex=True, sharey="row")
+        for column, (title, one) in zip(axes.T, shown, strict=True):
+            run = run_study(one, print).runs["noise-free"]["MPC"]
+            for i, panel in enumerate(column):
+                panel.plot(run.t / 60, run.y[:, i], color=BLUE, label="level")
+                dashed(panel, run, i)
+                look = {"color": (VERMILION, ORANGE)[i], "label": ("at least", "at most")[i]}
+                panel.axhline(limits[i], linestyle=":", linewidth=1.4, **look)
+            column[0].set_title(title)
+            column[1].set_xlabel("min")
+        for panel, name in zip(axes[:, 0], run.names.outputs, strict=True):
+            panel.set_ylabel(f"{name} level")
+        legend_above(figure)
+    return figure
+
+
+def targets_figure():
+    """The flow and both valves of `examples/resting-values.toml`, plain MPC and an exact price."""
+    runs = run_study(load_study(EXAMPLES / "resting-values.toml"), print).runs["with a load"]
+    with styled():
+        figure, axes = new_figure(3, 2, sharex=True, sharey="row")
+        for column, name in zip(axes.T, ("MPC", "price"), strict=True):
+            run, minutes = runs[name], runs[name].t / 60
+            column[0].plot(minutes, run.y[:, 0], color=BLUE, label="output")
+            dashed(column[0], run, 0)
+            for i, panel in enumerate(column[1:]):
+                panel.step(minutes, run.u[:, i], where="post", color=VERMILION, label="input", linewidth=0.9)
+            column[2].axhline(50.0, color=GREEN, linewidth=1.2, linestyle=":", label="resting value")
+            column[0].set_title(name)
+            column[2].set_xlabel("min")
+        for panel, name in zip(axes[:, 0], (*run.names.outputs, *run.names.inputs), strict=True):
+            panel.set_ylabel(name.replace("_", " "))
+        legend_above(figure)
+    return figure
 
 
 def export_figures():

@@ -205,7 +205,7 @@ def loops(draw):
             if method == "alternating":
                 settings = {"polish": True, "on_limit_violation": "keep_budget"}
         rules = mampc.MoveRules(
-            **draw(move_rules(n_c)), min_size=size if size <= most else 0.0, levels=told
+            **draw(move_rules(n_c)), min_size=size if size <= most and on_levels != "mixed" else 0.0, levels=told
         )  # fmt: skip
     other = None
     if draw(st.integers(0, 3)) == 0:

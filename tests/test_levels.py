@@ -373,3 +373,14 @@ def test_a_rule_around_inputs_on_levels_is_refused():
 def test_bad_settings_of_an_on_off_input_are_refused(settings):
     with pytest.raises(mampc.MampcError, match=next(iter(settings))):
         mampc.OnOff(**settings)
+
+
+def test_a_least_size_beside_levels_is_for_inputs_on_levels_alone():
+    """The program of inputs that take any value, for each course on levels, knows no least size."""
+    model = mampc.StateSpace.from_first_order(gain=[[1.0, 0.5]], time_constant=[[5.0, 3.0]], dt=1.0)
+    limits = mampc.Limits(u_min=0.0, u_max=4.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=4, control_horizon=2, limits=limits)
+    levels = [None, [0.0, 2.0, 4.0]]
+    with pytest.raises(mampc.MampcError, match="take any value beside others on levels"):
+        mampc.MAMPC(problem, mampc.MoveRules(min_size=0.4, levels=levels))
+    mampc.MAMPC(problem, mampc.MoveRules(min_size=[0.0, 3.0], levels=levels))

@@ -94,6 +94,11 @@ class MAMPC(Controller):
     def _check_sizes(self) -> None:
         """A least size beyond what an input can move means that it never does."""
         limits, size = self.problem.limits, self._admissible.min_size[: self.problem.model.n_inputs]
+        free = [] if self.levels is None else [values is None for values in self.levels.values]
+        if free and (size[free] > 0).any():
+            raise MampcError(
+                f"min_size: expected 0 for inputs that take any value beside others on levels, received {size}"
+            )
         for name, most in (("du_max", limits.du_max), ("u_max - u_min", limits.u_max - limits.u_min)):
             if (size > most).any():
                 raise MampcError(f"min_size: expected at most {name} = {most}, received {size}")
