@@ -9,7 +9,7 @@ import mampc
 from builders import identified_tank, tank_problem
 from mampc import KalmanFilter, LoadBank, MoveRules
 from mampc.study import parse_study, template
-from mampc.study.running import regulator_of
+from mampc.study.regulators import regulator_of
 
 PRICE = MoveRules(price=1.0)
 SPARSE = {

@@ -10,7 +10,8 @@ from mampc.report import output, reproduction
 from mampc.report.figures import study_figures
 from mampc.report.page import Page
 from mampc.study import load_study, parse_study, template
-from mampc.study.running import prepare, regulator_of, run_controller
+from mampc.study.regulators import regulator_of
+from mampc.study.running import prepare, run_controller
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ from builders import tank_model
 from mampc.report.summary import summarise
 from mampc.report.tables import comparison_tables
 from mampc.study import load_study, parse_study, run_study, template
-from mampc.study.running import initial_state, prepare, regulator_of
+from mampc.study.regulators import regulator_of
+from mampc.study.running import initial_state, prepare
 
 SHORT = (
     template()

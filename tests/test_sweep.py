@@ -64,7 +64,8 @@ def test_a_row_is_a_run_and_plain_mpc_is_among_them(swept):
 
 
 def test_a_run_of_a_sweep_is_the_run_of_its_study(swept):
-    from mampc.study.running import prepare, regulator_of, run_controller
+    from mampc.study.regulators import regulator_of
+    from mampc.study.running import prepare, run_controller
 
     sweep, _, rows = swept
     study = sweep.study

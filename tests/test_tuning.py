@@ -14,7 +14,8 @@ from mampc.compare import scenarios, tuning
 from mampc.compare.scenarios import even_weight, settling, usual_problem
 from mampc.compare.tuned_study import study_of_model, with_tuning
 from mampc.study import load_study, parse_study
-from mampc.study.running import regulator_of, run_study
+from mampc.study.regulators import regulator_of
+from mampc.study.running import run_study
 from mampc.study.writing import study_text
 
 SMALL = {

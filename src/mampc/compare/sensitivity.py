@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mampc.study.running import Prepared, prepare, regulator_of, run_controller
+from mampc.study.regulators import regulator_of
+from mampc.study.running import Prepared, prepare, run_controller
 from mampc.study.scenario_tables import ScenarioTable
 from mampc.study.schema import ControllerTable, Study
 

@@ -14,7 +14,8 @@ from mampc.base.errors import MampcError, shown
 from mampc.compare.fronts import Point
 from mampc.compare.journal import Journal
 from mampc.compare.knobs import variants
-from mampc.study.running import Prepared, prepare, regulator_of, run_seeds
+from mampc.study.regulators import regulator_of
+from mampc.study.running import Prepared, prepare, run_seeds
 from mampc.study.scenario_tables import ScenarioTable
 from mampc.study.schema import ControllerTable, Study
 

@@ -14,7 +14,8 @@ from mampc.compare.scenarios import CHANGE, CHANGES, STAND_IN, scenario_length
 from mampc.compare.sweep import BASELINE
 from mampc.compare.tuning import Tuned
 from mampc.loop.loads import Load
-from mampc.study.running import Prepared, load_of, regulator_of
+from mampc.study.regulators import regulator_of
+from mampc.study.running import Prepared, load_of
 from mampc.study.scenario_tables import (
     LOADS,
     ChangeTable,

@@ -19,7 +19,8 @@ from mampc.compare.sweep import Sweep, Task, points_of
 from mampc.loop.run import Run
 from mampc.report.fronts import SHOWN, WIDEST
 from mampc.report.interactive import DAY, Means, interactive_page
-from mampc.study.running import StudyResult, prepare, regulator_of, run_controller
+from mampc.study.regulators import regulator_of
+from mampc.study.running import StudyResult, prepare, run_controller
 from mampc.study.schema import ControllerTable
 
 Rows = list[dict[str, Any]]

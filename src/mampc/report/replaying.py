@@ -9,7 +9,8 @@ from mampc.base.errors import MampcError
 from mampc.loop.replay import Difference, Recording, replay
 from mampc.report.output import trajectories
 from mampc.study import Study
-from mampc.study.running import initial_state, prepare, regulator_of
+from mampc.study.regulators import regulator_of
+from mampc.study.running import initial_state, prepare
 from mampc.systems.state_space import StateSpace
 
 

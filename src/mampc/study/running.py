@@ -11,35 +11,27 @@ import numpy as np
 
 from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError, StudyError, shown
-from mampc.controllers import MAMPC, MPC, ControllerBank
-from mampc.controllers.controller import Controller
+from mampc.controllers import ControllerBank
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.loop.batch import Batch, simulate_batch
-from mampc.loop.defaults import default_estimator
-from mampc.loop.estimation import Estimator, KalmanFilter
-from mampc.loop.load_bank import LoadBank
 from mampc.loop.loads import Load, Residuals
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
-from mampc.loop.sensors import SensorChecks
 from mampc.loop.simulation import Course, acting_on, at_rest, closed_loop
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.plants import Plant
-from mampc.program.problem import Limits, TrackingProblem
 from mampc.program.zone import Zone
-from mampc.rivals.registry import RIVALS, rival
 from mampc.study.cautions import cautions
 from mampc.study.plugins import make_plant
+from mampc.study.regulators import problem_of, regulator_of
 from mampc.study.scenario_tables import LoadTable, ScenarioTable
-from mampc.study.schema import BANK, ControllerTable, EstimatorTable, IdentificationTable, Study
+from mampc.study.schema import IdentificationTable, Study
 from mampc.study.values import Values
 from mampc.study.wear import ratings_of
 from mampc.systems.mismatch import Mismatch
 from mampc.systems.signals import prbs, steps
 from mampc.systems.state_space import StateSpace
-
-EXECUTED = 1.05  # of what a valve does not answer: the least move, since nobody knows that exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +98,7 @@ def run_study(
             run = run_controller(study, prepared, scenario, regulators[table.name])
             runs[scenario.name][table.name] = run
             on_run(scenario.name, table.name, run)
-    warnings = cautions(study, _problem(study, prepared.model), _reference(study, prepared)) + _faults(runs)
+    warnings = cautions(study, problem_of(study, prepared.model), _reference(study, prepared)) + _faults(runs)
     return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings)
 
 
@@ -136,43 +128,6 @@ def prepare(
         data, order=settings.order, weighting=settings.weighting, feedthrough=settings.feedthrough
     )
     return Prepared(tested, u_op, v_op, identified.model, data, identified)
-
-
-def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
-    """The regulator that a study's tables describe."""
-    problem = _problem(study, model)
-    valves = None
-    if table.compensate and study.actuators is not None:
-        valves = study.actuators.valves()
-        table = _executed(table, valves, model.n_inputs)
-    controller = _controller(problem, table, study.controllers)
-    estimator = _estimator(study.estimator, controller)
-    counts = study.estimator.value_of_information and isinstance(estimator, LoadBank)
-    counts = counts and any(type(one) is MAMPC for one in controller.each)
-    smooth = None if table.reference_filter is None else table.reference_filter.made()
-    try:
-        return Regulator(
-            controller,
-            estimator,
-            reference_filter=smooth,
-            valves=valves,
-            value_of_information=counts,
-            price_follows_noise=counts and study.estimator.price_follows_noise,
-            **_sensors(study),
-        )
-    except MampcError as error:
-        raise StudyError(f"controllers, {table.name!r}: {error}") from None
-
-
-def _executed(table: ControllerTable, valves: Valves, n_inputs: int) -> ControllerTable:
-    """The controller with moves that valves execute, and some more."""
-    assert table.rules is not None
-    try:
-        least = EXECUTED * as_vector("actuators.jump", valves.jump, n_inputs)
-        size = np.maximum(as_vector("min_size", table.rules.min_size, n_inputs), least)
-    except MampcError as error:
-        raise StudyError(f"controllers, {table.name!r}: {error}") from None
-    return table.model_copy(update={"rules": table.rules.model_copy(update={"min_size": size.tolist()})})
 
 
 def run_controller(study: Study, prepared: Prepared, scenario: ScenarioTable, regulator: Regulator) -> Run:
@@ -288,16 +243,6 @@ def _disturbance(study: Study, scenario: ScenarioTable, value: Values, usual: An
         raise StudyError(f"scenarios, {scenario.name!r}, disturbances: {error}") from None
 
 
-def _problem(study: Study, model: StateSpace) -> TrackingProblem:
-    table = study.problem
-    try:
-        return TrackingProblem(
-            model, **table.model_dump(exclude={"limits"}), limits=Limits(**table.limits.model_dump())
-        )
-    except MampcError as error:
-        raise StudyError(f"[problem] {error}") from None
-
-
 def _operating_point(study: Study, plant: Plant | StateSpace) -> tuple[Array, Array]:
     """Usual inputs (m,) and measured disturbances (d,) of the plant."""
     m, d = len(plant.names.inputs), len(plant.names.disturbances)
@@ -330,57 +275,6 @@ def _record(
     return excite(plant, signal, dt=dt, noise=table.noise, seed=table.seed, x0=rest)
 
 
-def _controller(
-    problem: TrackingProblem, table: ControllerTable, tables: Sequence[ControllerTable]
-) -> Controller:
-    try:
-        if table.method == BANK:
-            named = {other.name: other for other in tables}
-            return ControllerBank(
-                {name: _controller(problem, named[name], tables) for name in table.variants}
-            )
-        if table.method in RIVALS:
-            around = None if table.around == "mpc" else _sparse(problem, table, table.around, {})
-            return rival(table.method, problem, table.settings, around=around)
-        return (
-            MPC(problem) if table.method == "mpc" else _sparse(problem, table, table.method, table.settings)
-        )
-    except MampcError as error:
-        raise StudyError(f"controllers, {table.name!r}: {error}") from None
-
-
-def _sparse(problem: TrackingProblem, table: ControllerTable, method: str, settings: dict[str, Any]) -> MAMPC:
-    assert table.rules is not None
-    return MAMPC(
-        problem, table.rules.made(), method=method,
-        on_limit_violation=table.on_limit_violation, violation_margin=table.violation_margin, **settings,
-    )  # fmt: skip
-
-
-def _estimator(table: EstimatorTable, controller: Controller) -> Estimator:
-    problem = controller.problem
-    try:
-        if table.kind == "load_bank":
-            if table.price_follows_noise and table.measurement_noise is not None:
-                return LoadBank(problem.model, noise=table.measurement_noise, guessed=True)
-            return LoadBank.for_problem(problem, noise=table.measurement_noise)
-        if table.is_kalman_filter:
-            told = table.model_dump(include={"disturbance", "measurement_noise", "drift", "input_noise"})
-            return KalmanFilter.offset_free(problem.model, **told)
-        return default_estimator(controller, table.measurement_noise)
-    except MampcError as error:
-        raise StudyError(f"[estimator] {error}") from None
-
-
-def _sensors(study: Study) -> dict[str, Any]:
-    checks = study.sensors.model_dump()
-    blind = checks.pop("max_blind_steps")
-    try:
-        return {"sensors": SensorChecks(**checks), "max_blind_steps": blind}
-    except MampcError as error:
-        raise StudyError(f"[sensors] {error}") from None
-
-
 def _reference(study: Study, prepared: Prepared) -> Array:
     table, plant = study.reference, prepared.plant
     if len(table.initial) != len(plant.names.outputs):
@@ -404,7 +298,7 @@ def _asked(study: Study, prepared: Prepared) -> Array | Zone:
     reference = _reference(study, prepared)
     if not study.reference.zones:
         return reference
-    l, problem = reference.shape[1], _problem(study, prepared.model)
+    l, problem = reference.shape[1], problem_of(study, prepared.model)
     below, above = (np.tile(width, (study.steps, 1)) for width in (problem.zone_below, problem.zone_above))
     try:
         for zone in sorted(study.reference.zones, key=lambda zone: zone.at):

@@ -91,11 +91,8 @@ class StateSpace:
 
     def __repr__(self) -> str:
         names = self.names
-        parts = [
-            f"{self.n_states} states",
-            f"inputs {_listed(names.inputs)}",
-            f"outputs {_listed(names.outputs)}",
-        ]
+        sizes = f"{self.n_states} states"
+        parts = [sizes, f"inputs {_listed(names.inputs)}", f"outputs {_listed(names.outputs)}"]
         if names.disturbances:
             parts.append(f"measured disturbances {_listed(names.disturbances)}")
         return (
