@@ -197,6 +197,18 @@ def test_inside_its_zone_an_output_costs_nothing_and_moves_nothing():
                 assert not decision.moves.any()
 
 
+def test_where_no_move_helps_none_is_made_though_none_has_a_price():
+    """An output outside its zone comes back by itself at the next sample."""
+    problem = mampc.TrackingProblem(
+        mampc.StateSpace([[0.5]], [[1.0]], [[1.0]], None, 1.0), prediction_horizon=8, control_horizon=4,
+        zone_below=0.6, zone_above=0.6,
+    )  # fmt: skip
+    controller = mampc.MAMPC(problem, mampc.MoveRules(max_moves=3, sparsity_horizon=1))
+    decision = controller.step(controller.initial_state(), [1.0], [0.0])
+    assert decision.status is Status.OPTIMAL
+    assert not decision.moves.any()
+
+
 def test_noise_within_a_zone_moves_nothing():
     problem = tank_problem(zone_below=0.5, zone_above=0.5)
     regulator = mampc.Regulator(mampc.MPC(problem))

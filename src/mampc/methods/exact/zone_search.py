@@ -49,8 +49,10 @@ def _most_moves(problem: SampleProblem, least: float) -> int:
     if of.simultaneous:
         return most
     price, gain = float(of.price.min()), problem.cutoff - least
+    if gain <= 0:
+        return 0
     if gain < most * price:
-        most = int(max(gain, 0.0) / price)
+        most = int(gain / price)
     return int(min(most, problem.allowance.left))
 
 
