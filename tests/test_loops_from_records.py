@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import mampc
-from mampc.study.own import LEFT, draft
+from mampc.controllers.offset import LEFT
+from mampc.study.own import draft
 from mampc.systems.properties import properties
 from seeds import seeds
 

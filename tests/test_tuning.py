@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import mampc
 from builders import tank_model
 from mampc.cli import app
-from mampc.compare import scenarios, tuning
+from mampc.compare import candidates, scenarios, tuning
 from mampc.compare.scenarios import even_weight, settling, usual_problem
 from mampc.compare.tuned_study import study_of_model, with_tuning
 from mampc.study import load_study, parse_study
@@ -19,7 +19,7 @@ from mampc.study.running import run_study
 from mampc.study.writing import study_text
 
 SMALL = {
-    "SEARCHED": 3, "REFINED": 4, "CONFIRMED": 6, "SEARCH_PRICES": 3, "REFINE_PRICES": 4, "MOVE_WEIGHTS": (0.1,),
+    "SEARCHED": 3, "REFINED": 4, "CONFIRMED": 8, "SEARCH_PRICES": 3, "REFINE_PRICES": 4,
 }  # fmt: skip
 
 
@@ -28,6 +28,7 @@ def _few_and_short():
     with pytest.MonkeyPatch.context() as patch:
         for name, value in SMALL.items():
             patch.setattr(tuning, name, value)
+        patch.setattr(candidates, "MOVE_WEIGHTS", (0.1,))
         patch.setattr(scenarios, "LENGTHS", (80, 80))
         yield
 
@@ -82,7 +83,11 @@ def test_what_is_found_can_be_used_at_other_prices(tank):
     assert [point.error_ratio.value for point in tank.front] == sorted(
         point.error_ratio.value for point in tank.front
     )
-    assert "means over 6 scenarios" in str(tank.expected)
+    assert "means over 8 scenarios" in str(tank.expected)
+    ratios = [ratio.value for ratio in tank.expected.by_load]
+    assert len(ratios) == len(tank.loads)
+    assert min(ratios) <= tank.expected.error_ratio.value <= max(ratios)
+    assert f"by kind of load {min(ratios):.2f} to {max(ratios):.2f}" in str(tank.expected)
     assert "standard error" in str(tank.expected)
 
 
@@ -147,7 +152,7 @@ def test_the_horizon_covers_what_step_responses_take_to_settle():
 def test_plans_have_moves_at_two_samples_at_least(inputs, samples):
     model = lag(gain=np.eye(inputs), time_constant=np.full((inputs, inputs), 50.0))
     problem = usual_problem(model, mampc.Limits(u_min=-1.0, u_max=1.0), 1.0)
-    found = tuning.candidates(problem, np.full(inputs, 0.01))
+    found = candidates.candidates(problem, np.full(inputs, 0.01))
     assert {one.problem.control_horizon for one in found} == {samples}
 
 
@@ -267,7 +272,7 @@ def test_the_command_writes_a_study_that_runs(folder, source):
     result = command(*source, "--max-error-increase", "25%", "--out", "out")
     assert result.exit_code == 0, result.output
     assert "standard error" in result.output
-    assert "means over 6 scenarios" in result.output
+    assert "means over 8 scenarios" in result.output
     assert (folder / "out" / "front.png").exists()
     study = load_study(folder / "out" / "tuned.toml")
     assert study.controllers[0].rules.price > 0

@@ -16,7 +16,9 @@ import numpy as np
 from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError
 from mampc.base.progress import watched
-from mampc.compare.fronts import FEWEST, Estimate, Point, non_dominated
+from mampc.compare.candidates import Candidate, candidates
+from mampc.compare.fronts import Estimate, Point, non_dominated
+from mampc.compare.promise import Expected, Goal, error_ratio, moves_per_hour
 from mampc.compare.scenarios import Scenarios, Surroundings, usual_problem
 from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.loop.estimation import Estimator, KalmanFilter
@@ -26,140 +28,12 @@ from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.state_space import StateSpace
 
-MOVE_WEIGHTS = (0.1, 0.3)  # times those of plain MPC
-TAILS = (0.0, 0.25, 1.0)  # times the prediction horizon
-CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
-MOST_MOVES = (
-    9  # planned moves of all inputs together, within these, which keeps the patterns to a few hundred
-)
-
 SEARCHED, REFINED, CONFIRMED = 8, 16, 32  # scenarios of the three rounds
 SEARCH_PRICES, REFINE_PRICES = 6, 11
 SEARCH_SPAN = (3e-3, 3.0)  # prices over the error of plain MPC in a prediction horizon
 REFINE_SPAN = 4.0  # prices up and down from where the first round led
 FINALISTS = 2
-AIM = 0.9  # share of the allowance that the first two rounds aim at
-BACK = 0.8  # factor of the price where a confirmation fails
 TRIES = 16  # confirmations of one finalist
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A controller but for its price.
-
-    Attributes:
-        name: in tables.
-        problem: what it solves.
-        estimator: with the noise that it expects.
-        guessed: whether nobody told this noise, so that the price follows what is found of it.
-    """
-
-    name: str
-    problem: TrackingProblem
-    estimator: LoadBank
-    guessed: bool = False
-
-    def regulator(self, price: float) -> Regulator:
-        """It, with a price."""
-        controller = MAMPC(self.problem, MoveRules(price=price))
-        return Regulator(
-            controller, self.estimator, value_of_information=True, price_follows_noise=self.guessed
-        )
-
-    def points(self, prices: Sequence[float], scenarios: Scenarios) -> list[Point]:
-        """Its moves and errors in every scenario, price by price."""
-        found = scenarios.run_each([self.regulator(price) for price in prices])
-        return [Point(self.name, price, *run) for price, run in zip(prices, found, strict=True)]
-
-
-@dataclass(frozen=True)
-class Goal:
-    """What is allowed: an increase of the error over that of plain MPC, or moves per hour."""
-
-    max_error_increase: float | None
-    max_moves_per_hour: float | None
-    hours: float = field(default=0.0, kw_only=True)
-
-    def used(self, point: Point, baseline: Point) -> Estimate:
-        """The share of what is allowed that a setting uses, 1 for all of it."""
-        if self.max_error_increase is not None:
-            ratio = error_ratio(point, baseline)
-            return Estimate(
-                (ratio.value - 1) / self.max_error_increase, ratio.standard_error / self.max_error_increase
-            )
-        assert self.max_moves_per_hour is not None
-        moves = moves_per_hour(point, self.hours)
-        return Estimate(moves.value / self.max_moves_per_hour, moves.standard_error / self.max_moves_per_hour)
-
-    def at_aim(self, points: Sequence[Point], baseline: Point) -> tuple[float, float]:
-        """How good a candidate is where it uses `AIM` of what is allowed, lower being better, and the price there.
-
-        Infinite where no price uses so little.
-        """
-        order = sorted(points, key=lambda point: point.value)
-        used = np.array([self.used(point, baseline).value for point in order])
-        if self.max_error_increase is not None:  # a higher price uses more of it
-            used = np.maximum.accumulate(used)
-            worth = np.log([max(point.moves.mean(), FEWEST) for point in order])
-        else:
-            used, order = np.maximum.accumulate(used[::-1]), order[::-1]
-            worth = np.log([max(point.error.mean(), 1e-300) for point in order])
-        logs = np.log([point.value for point in order])
-        if used[0] > AIM:
-            return np.inf, float(np.exp(logs[0]))
-        return float(np.interp(AIM, used, worth)), float(np.exp(np.interp(AIM, used, logs)))
-
-    @property
-    def back(self) -> float:
-        """The factor by which a price uses less."""
-        return BACK if self.max_error_increase is not None else 1 / BACK
-
-
-def error_ratio(point: Point, baseline: Point) -> Estimate:
-    """Mean error over that of plain MPC in the same loops, with the standard error of this ratio of means."""
-    mean = float(baseline.error.mean())
-    ratio = float(point.error.mean()) / mean
-    if not np.isfinite(ratio):
-        return Estimate(np.inf, np.inf)
-    return Estimate(ratio, _standard_error(point.error - ratio * baseline.error) / mean)
-
-
-def moves_per_hour(point: Point, hours: float) -> Estimate:
-    """Mean moves of all inputs together in an hour."""
-    return Estimate(float(point.moves.mean()) / hours, _standard_error(point.moves) / hours)
-
-
-def _short(number: float) -> str:
-    return f"{number:.0f}" if abs(number) >= 100 else f"{number:.3g}"
-
-
-def _standard_error(values: Array) -> float:
-    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
-
-
-@dataclass(frozen=True)
-class Expected:
-    """What tuning promises: means over scenarios, with their standard errors.
-
-    Attributes:
-        moves_per_hour: of all inputs together.
-        error_ratio: mean tracking error over that of plain MPC in the same scenarios.
-        plain_moves_per_hour: of plain MPC.
-        scenarios: how many they are means over.
-    """
-
-    moves_per_hour: Estimate
-    error_ratio: Estimate
-    plain_moves_per_hour: Estimate
-    scenarios: int
-
-    def __str__(self) -> str:
-        moves, error, plain = self.moves_per_hour, self.error_ratio, self.plain_moves_per_hour
-        return (
-            f"{_short(moves.value)} moves per hour (standard error {_short(moves.standard_error)}; plain MPC "
-            f"{_short(plain.value)}) at {error.value:.3f} times the error of plain MPC (standard error "
-            f"{error.standard_error:.2g}): means over {self.scenarios} scenarios, from which a single run may differ"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,8 +147,8 @@ def tune(
 
     The promise is a mean over scenarios, with its standard error: on plants off the model by up to 15 % in each gain,
     lag and dead time, with set-points, noise and loads as told or assumed, the mean tracking error plus half its
-    standard error is at most 1 + `max_error_increase` times that of plain MPC in the same scenarios. A single run may
-    exceed it.
+    standard error is at most 1 + `max_error_increase` times that of plain MPC in the same scenarios. A single run, and
+    all runs under one kind of load, may exceed it: `expected.by_load` says by how much.
 
     Args:
         model: a discrete model.
@@ -299,7 +173,7 @@ def tune(
     Raises:
         MampcError: values that do not fit, two goals, or inputs without limits where sizes are derived from them.
     """
-    goal = _goal(max_error_increase, max_moves_per_hour)
+    goal = Goal.asked(max_error_increase, max_moves_per_hour)
     as_whole("seed", seed, 0)
     plain = _plain(model, limits, output_weight, baseline)
     problem = plain.controller.problem
@@ -340,10 +214,7 @@ def tune(
     chosen, price, point, reached = _confirmed(goal, finalists, last, last_base)
     tell()
     next(bar, None)
-    expected = Expected(
-        moves_per_hour(point, last.hours), error_ratio(point, last_base), moves_per_hour(last_base, last.hours),
-        len(last),
-    )  # fmt: skip
+    expected = Expected.of(point, last_base, last.hours, len(around.loads))
     front: tuple[FrontPoint, ...] = ()
     if chosen is not None:
         own = next(points for *_, candidate, points in finalists if candidate is chosen)
@@ -353,15 +224,6 @@ def tune(
         around.noise, chosen is not None and chosen.guessed, plain.estimator if chosen is None else chosen.estimator,
         around.loads, rows,
     )  # fmt: skip
-
-
-def _goal(max_error_increase: float | None, max_moves_per_hour: float | None) -> Goal:
-    if max_moves_per_hour is None:
-        given = 0.25 if max_error_increase is None else max_error_increase
-        return Goal(as_number("max_error_increase", given, 0.0, exclusive=True), None)
-    if max_error_increase is not None:
-        raise MampcError("tune: expected one of max_error_increase and max_moves_per_hour, received both")
-    return Goal(None, as_number("max_moves_per_hour", max_moves_per_hour, 0.0, exclusive=True))
 
 
 def _plain(
@@ -384,31 +246,6 @@ def _plain(
     if limits is not None:
         raise MampcError("limits: expected those of the baseline, received others beside it")
     return baseline
-
-
-def candidates(problem: TrackingProblem, noise: Array, guessed: bool = False) -> list[Candidate]:
-    """All that are compared, for a problem of plain MPC and noise (l,) that was told or guessed."""
-    m, n_p = problem.model.n_inputs, problem.prediction_horizon
-    n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
-    estimator, found = LoadBank(problem.model, noise=noise, guessed=guessed), []
-    for share in MOVE_WEIGHTS:
-        for tail in TAILS:
-            sparse = replace(
-                problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail * n_p
-            )
-            candidate = Candidate(f"move weight x {share:g}, tail {tail * n_p:g}", sparse, estimator, guessed)
-            for one in (candidate, replace(candidate, guessed=False)):
-                try:
-                    one.regulator(1.0)
-                except (
-                    MampcError
-                ):  # such as a tail that an unstable model does not have, or too many patterns
-                    continue
-                found.append(one)
-                break
-    if not found:
-        raise MampcError("tune: expected a model that a sparse controller can be built for")
-    return found
 
 
 def _drawn(

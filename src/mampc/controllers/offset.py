@@ -1,4 +1,4 @@
-"""How large an offset a price can leave for good.
+"""How large an offset a price can leave for good, and the price that follows from it where nothing is simulated.
 
 In steady state with an offset e = r - y, an exact controller that does not move now costs at least (L + 1) |e|^2_Q, L
 being the `tail_horizon`: it holds, which costs (np + 1 + L) |e|^2_Q, or it plans to move later; and then the same
@@ -18,6 +18,9 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import TrackingProblem
+
+HIGHEST_PRICE = 1 / 16  # of what moves save after a change: changes of a quarter of it are still worth them
+LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
 
 
 def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
@@ -73,3 +76,19 @@ def largest_saving(condensed: CondensedQP, change: Array) -> float:
     unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)  # so that no input's unit counts
     g = unit * (theta.T @ held)
     return float(g @ np.linalg.lstsq(unit[:, None] * H * unit, g)[0])
+
+
+def highest_price(problem: TrackingProblem, changes: Array) -> float:
+    """A price that pays after every change of the reference, rows of (k, l), to two digits.
+
+    It leaves at most half of a change for good where `largest_offset` promises anything. `mampc.tune` finds prices by
+    simulation instead.
+    """
+    price = HIGHEST_PRICE * min(largest_saving(CondensedQP(problem), change) for change in changes)
+    price /= problem.model.n_inputs
+    offset = largest_offset(problem, MoveRules(price=price))
+    asked = np.where(changes != 0, np.abs(changes), np.inf).min(axis=0)
+    share = offset[np.isfinite(asked)] / asked[np.isfinite(asked)]
+    if np.isfinite(share).all() and share.max() > LEFT:
+        price *= float(LEFT / share.max()) ** 2
+    return float(f"{price:.2g}")

@@ -15,8 +15,7 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
-from mampc.controllers.offset import largest_offset, largest_saving
-from mampc.moves.rules import MoveRules
+from mampc.controllers.offset import HIGHEST_PRICE, highest_price
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import MOST_PREDICTIONS, Limits, TrackingProblem
 from mampc.systems.properties import Properties, properties, time_in_words
@@ -27,13 +26,9 @@ SHORTEST_HORIZON = 10
 ASKED = 0.3  # of what inputs can hold: the change of reference
 GUESSED_NOISE = 0.02  # of that change, where no record told
 MOST_CHANGES = 4  # of single outputs
-HIGHEST_PRICE = (
-    1 / 16
-)  # of what moves save after such a change: changes of a quarter of it are still worth them
 USUAL = 1 / 4  # of the highest price: it costs next to no error
 DEAD_BAND = 0.01  # of the inputs' range
 LARGEST_WEIGHT = 1e9
-LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
 EFFORT = 0.1  # of the error that an input's change makes, in one sample: what its move costs
 
 
@@ -94,7 +89,9 @@ def draft(model: StateSpace, found: Properties) -> Draft:
     known_noise = model.noise is not None and bool((model.noise.output > 0).any())
     noise = model.noise.output if known_noise and model.noise is not None else GUESSED_NOISE * asked
     every = min(max(int(1.5 * settling) + dead, 20), 2 * LONGEST_HORIZON)
-    return Draft(problem, changes, every, _price(problem, changes), _rounded(noise), known, known_noise)
+    return Draft(
+        problem, changes, every, highest_price(problem, changes), _rounded(noise), known, known_noise
+    )
 
 
 def _input_limits(model: StateSpace) -> tuple[Array, Array, bool]:
@@ -179,18 +176,6 @@ def _stable(problem: TrackingProblem) -> TrackingProblem:
             limits=problem.limits, tail_horizon=float(horizon) if problem.tail_horizon else 0.0,
         )  # fmt: skip
     return problem
-
-
-def _price(problem: TrackingProblem, changes: Array) -> float:
-    """A price that pays after every change, and leaves at most half of it where `largest_offset` promises anything."""
-    condensed, m = CondensedQP(problem), problem.model.n_inputs
-    price = HIGHEST_PRICE * min(largest_saving(condensed, change) for change in changes) / m
-    offset = largest_offset(problem, MoveRules(price=price))
-    asked = np.where(changes != 0, np.abs(changes), np.inf).min(axis=0)
-    share = offset[np.isfinite(asked)] / asked[np.isfinite(asked)]
-    if np.isfinite(share).all() and share.max() > LEFT:
-        price *= float(LEFT / share.max()) ** 2
-    return float(f"{price:.2g}")
 
 
 def _rounded(values: Array, digits: int = 2) -> Array:

@@ -1,0 +1,79 @@
+"""The controllers that tuning compares: all have a load bank and count on later data; move weight and tail differ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.base.errors import MampcError
+from mampc.compare.fronts import Point
+from mampc.compare.scenarios import Scenarios
+from mampc.controllers import MAMPC
+from mampc.loop.load_bank import LoadBank
+from mampc.loop.regulator import Regulator
+from mampc.moves.rules import MoveRules
+from mampc.program.problem import TrackingProblem
+
+MOVE_WEIGHTS = (0.1, 0.3)  # times those of plain MPC
+TAILS = (0.0, 0.25, 1.0)  # times the prediction horizon
+CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
+MOST_MOVES = (
+    9  # planned moves of all inputs together, within these, which keeps the patterns to a few hundred
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A controller but for its price.
+
+    Attributes:
+        name: in tables.
+        problem: what it solves.
+        estimator: with the noise that it expects.
+        guessed: whether nobody told this noise, so that the price follows what is found of it.
+    """
+
+    name: str
+    problem: TrackingProblem
+    estimator: LoadBank
+    guessed: bool = False
+
+    def regulator(self, price: float) -> Regulator:
+        """It, with a price."""
+        controller = MAMPC(self.problem, MoveRules(price=price))
+        return Regulator(
+            controller, self.estimator, value_of_information=True, price_follows_noise=self.guessed
+        )
+
+    def points(self, prices: Sequence[float], scenarios: Scenarios) -> list[Point]:
+        """Its moves and errors in every scenario, price by price."""
+        found = scenarios.run_each([self.regulator(price) for price in prices])
+        return [Point(self.name, price, *run) for price, run in zip(prices, found, strict=True)]
+
+
+def candidates(problem: TrackingProblem, noise: Array, guessed: bool = False) -> list[Candidate]:
+    """All that are compared, for a problem of plain MPC and noise (l,) that was told or guessed."""
+    m, n_p = problem.model.n_inputs, problem.prediction_horizon
+    n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
+    estimator, found = LoadBank(problem.model, noise=noise, guessed=guessed), []
+    for share in MOVE_WEIGHTS:
+        for tail in TAILS:
+            sparse = replace(
+                problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail * n_p
+            )
+            candidate = Candidate(f"move weight x {share:g}, tail {tail * n_p:g}", sparse, estimator, guessed)
+            for one in (candidate, replace(candidate, guessed=False)):
+                try:
+                    one.regulator(1.0)
+                except (
+                    MampcError
+                ):  # such as a tail that an unstable model does not have, or too many patterns
+                    continue
+                found.append(one)
+                break
+    if not found:
+        raise MampcError("tune: expected a model that a sparse controller can be built for")
+    return found
