@@ -62,6 +62,12 @@ def regulators_of(case: Case, method: str, structure: tuple, knobs: Any) -> list
         "rounding, hysteresis": lambda knob: rivals.Rounded(mpc, step=knob * unit, hysteresis=0.4),
         "event-triggered": lambda knob: rivals.EventTriggered(mpc, threshold=knob * sigma),
         "l1 on moves": lambda knob: rivals.Penalised(problem, penalty=rivals.L1(weight=10 * knob, size=unit)),
+        "group l2 on moves": lambda knob: rivals.Penalised(
+            problem, penalty=rivals.GroupL2(weight=10 * knob, size=unit)
+        ),
+        "CLOT on moves": lambda knob: rivals.Penalised(
+            problem, penalty=rivals.CLOT(weight=10 * knob, size=unit)
+        ),
         "elastic net on moves": lambda knob: rivals.Penalised(
             problem, penalty=rivals.ElasticNet(weight=10 * knob, size=unit)
         ),
@@ -92,21 +98,30 @@ METHODS = {
     "l1 on moves": DRIFTS,
     "elastic net on moves": DRIFTS,
     "concave penalty on moves": tuple((0.3, 0.0, 1.0, name) for name in CONCAVE),
-    "l0 on inputs": DRIFTS,
     "self-triggered": DRIFTS,
     "dead-band, load bank": BANKS,
     "rounding, hysteresis, load bank": BANKS,
 }
+ASKED = dict.fromkeys(("l0 on inputs", "group l2 on moves", "CLOT on moves"), DRIFTS[1:2])  # run where named
 LIMITS = ("non-anticipative", "clairvoyant")
-EVERYTHING = METHODS | dict.fromkeys(LIMITS, ())
+EVERYTHING = METHODS | dict.fromkeys(LIMITS, ()) | ASKED
 
 
-def measured(case: Case, kind: str, method: str, structure: tuple, knobs: Any, seeds: range) -> list[Point]:
-    """A method over its knob, in the same scenarios at every value."""
+def measured(
+    case: Case,
+    kind: str,
+    method: str,
+    structure: tuple,
+    knobs: Any,
+    seeds: range,
+    *,
+    sized_for: Case | None = None,
+) -> list[Point]:
+    """A method over its knob, in the same scenarios at every value; loads are sized for the case, or another one."""
     regulators = regulators_of(case, method, structure, knobs)
     batch = mampc.simulate_batch(
         case.plant, [own for own in regulators for _ in seeds], reference_of(case), seeds=[*seeds] * len(knobs),
-        noise=case.noise, loads=load_of(kind, case), progress=False,
+        noise=case.noise, loads=load_of(kind, sized_for or case), progress=False,
     )  # fmt: skip
     moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2)).reshape(-1, len(seeds))
     error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2)).reshape(-1, len(seeds))
@@ -139,7 +154,7 @@ def cell(name: str, kind: str, method: str, quick: bool) -> dict:
     knobs, about = (KNOB[::2], ABOUT[::4]) if quick else (KNOB, ABOUT)
     tuning, evaluation = (TUNING[:1], EVALUATION[:2]) if quick else (TUNING, EVALUATION)
     base, baseline = (baseline_of(name, kind, seeds) for seeds in (tuning, evaluation))
-    structures = METHODS[method]
+    structures = EVERYTHING[method]
     each = [measured(case, kind, method, structure, knobs, tuning) for structure in structures]
     at = [moves_at(own, base, RATIO).value for own in each]
     best = int(np.argmin(np.where(np.isfinite(at), at, np.inf)))
@@ -183,12 +198,19 @@ def journals_of(quick: bool, again: list[str]) -> dict[str, Journal]:
     return journals
 
 
-def run(journals: dict[str, Journal], quick: bool, jobs: int, plants: list[str], methods: list[str]) -> None:
+def run(
+    journals: dict[str, Journal],
+    quick: bool,
+    jobs: int,
+    plants: list[str],
+    methods: list[str],
+    kinds: Any = LOADS,
+) -> None:
     """Whatever is not finished."""
     missing = [
         (name, kind, method)
-        for method in EVERYTHING for kind in LOADS for name in cases()
-        if (not plants or name in plants) and (not methods or method in methods)
+        for method in EVERYTHING for kind in kinds for name in cases()
+        if (not plants or name in plants) and method in (methods or EVERYTHING.keys() - ASKED.keys())
         and str((name, kind)) not in journals[method].done
     ]  # fmt: skip
     began = time.time()
@@ -227,7 +249,10 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer seeds and settings, to see that it runs")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--plants", nargs="*", default=[], help="only these")
-    parser.add_argument("--methods", nargs="*", default=[], help="only these")
+    parser.add_argument(
+        "--methods", nargs="*", default=[], help=f"only these; {', '.join(ASKED)} run where named"
+    )
+    parser.add_argument("--loads", nargs="*", default=list(LOADS), help="only these")
     parser.add_argument("--again", nargs="*", default=[], help="methods to run anew")
     parser.add_argument(
         "--draw", action="store_true", help="tables and the heat map from the results there are"
@@ -235,7 +260,7 @@ def main() -> None:
     given = parser.parse_args()
     journals = journals_of(given.quick, given.again)
     if not given.draw:
-        run(journals, given.quick, given.jobs, given.plants, given.methods)
+        run(journals, given.quick, given.jobs, given.plants, given.methods, given.loads)
     if any(journal.done for journal in journals.values()):
         collect(journals, given.quick)
     import attention_report

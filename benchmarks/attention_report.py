@@ -14,6 +14,7 @@ DOCS = Path(__file__).parent.parent / "docs"
 RATIO, RATIOS = 1.25, (1.05, 1.1, 1.25, 1.5)
 BEGIN, END = "<!-- attention, by `make attention` -->", "<!-- end of attention -->"
 OURS = ("exact price, load bank", "exact price")
+UNDER_RULES = ("dead-band, load bank", "rounding, hysteresis, load bank")  # our estimator without our plans
 LIMITS = ("non-anticipative", "clairvoyant")
 SURE = 2.0  # standard errors
 
@@ -53,6 +54,7 @@ def told(results: Path) -> tuple[str, Cells, list[str]]:
         *unmeasured(cells, methods),
         figure,
         standing(cells, methods),
+        *under_rules(cells),
         by_load(cells, methods),
     ]
     parts += [by_ratio(cells, methods), losses(cells, methods), by_cell(cells, methods)]
@@ -62,17 +64,40 @@ def told(results: Path) -> tuple[str, Cells, list[str]]:
 
 
 def cells_of(rows: list[dict[str, Any]]) -> Cells:
+    """The moves of every row; a limit is what the search found or a controller reached in the same scenarios."""
     cells: Cells = {}
+    curves: dict[tuple[str, str], dict[str, list[Point]]] = {}
     for row in rows:
         points = [
             Point(row["method"], p["knob"], np.array(p["moves"]), np.array(p["error"])) for p in row["points"]
         ]
-        found = {}
-        for ratio in RATIOS:
-            value, error = moves_at(points[1:], points[0], ratio)
-            found[ratio] = Moves(100 * value if np.isfinite(value) else np.inf, 100 * error)
-        cells.setdefault((row["plant"], row["load"]), {})[row["method"]] = found
+        where = row["plant"], row["load"]
+        curves.setdefault(where, {})[row["method"]] = points
+        cells.setdefault(where, {})[row["method"]] = {ratio: at(points, ratio) for ratio in RATIOS}
+    for where, cell in cells.items():
+        for limit in [name for name in LIMITS if name in cell]:
+            count = len(curves[where][limit][0].moves)
+            fewest = [
+                {ratio: at([first(p, count) for p in points], ratio) for ratio in RATIOS}
+                for name, points in curves[where].items() if name not in LIMITS
+            ]  # fmt: skip
+            if limit == LIMITS[1] and LIMITS[0] in cell:
+                fewest.append(cell[LIMITS[0]])
+            for ratio in RATIOS:
+                found = [cell[limit][ratio], *(one[ratio] for one in fewest)]
+                cell[limit][ratio] = min(found, key=lambda moves: moves.value)
     return cells
+
+
+def at(points: list[Point], ratio: float) -> Moves:
+    """Moves of the points but the first, which is plain MPC, at a ratio of errors."""
+    value, error = moves_at(points[1:], points[0], ratio)
+    return Moves(100 * value if np.isfinite(value) else np.inf, 100 * error)
+
+
+def first(point: Point, count: int) -> Point:
+    """A point in so many scenarios only."""
+    return Point(point.method, point.value, point.moves[:count], point.error[:count])
 
 
 def made_by(how: dict[str, Any]) -> str:
@@ -91,7 +116,9 @@ def unmeasured(cells: Cells, methods: list[str]) -> list[str]:
 
 
 def best_rival(cell: dict[str, dict[float, Moves]], ratio: float = RATIO) -> tuple[str, Moves]:
-    rivals = {name: found[ratio] for name, found in cell.items() if name not in (*OURS, *LIMITS)}
+    rivals = {
+        name: found[ratio] for name, found in cell.items() if name not in (*OURS, *UNDER_RULES, *LIMITS)
+    }
     name = min(rivals, key=lambda name: rivals[name].value)
     return name, rivals[name]
 
@@ -125,6 +152,30 @@ def standing(cells: Cells, methods: list[str]) -> str:
         )
         lines.append(text + (f" Never within the error in {never}." if never else ""))
     return "\n\n".join([f"At {RATIO:g} times plain MPC's error:", *lines])
+
+
+def under_rules(cells: Cells) -> list[str]:
+    """What the load bank gives under simple rules, and what plans add to that."""
+    whole = [cell for cell in cells.values() if all(name in cell for name in (*UNDER_RULES, OURS[0]))]
+    if not whole:
+        return []
+    alone = []
+    for name in UNDER_RULES:
+        usual = name.removesuffix(", load bank")
+        ratio = [factor(cell[name][RATIO], cell[usual][RATIO])[0] for cell in whole if usual in cell]
+        alone.append(
+            f"{np.exp(np.log(ratio).mean()):.2f} times the moves of {usual} with the best of three filters"
+        )
+    best = [min((cell[name][RATIO] for name in UNDER_RULES), key=lambda moves: moves.value) for cell in whole]
+    factors = [factor(cell[OURS[0]][RATIO], rule) for cell, rule in zip(whole, best, strict=True)]
+    fewer = sum(np.log(f) < -SURE * e for f, e in factors)
+    more = sum(np.isinf(f) or np.log(f) > SURE * e for f, e in factors)
+    mean = np.exp(np.mean([np.log(f) for f, _ in factors if np.isfinite(f)]))
+    return [
+        f"**The load bank under simple rules**, around plain MPC: {' and '.join(alone)}. {OURS[0]} makes {mean:.2f} "
+        f"times the moves of the better of these two in each cell: fewer in {fewer} and more in {more} of "
+        f"{len(factors)}, beyond {SURE:g} standard errors."
+    ]
 
 
 def by_load(cells: Cells, methods: list[str]) -> str:
@@ -218,7 +269,8 @@ def limits(cells: Cells) -> str:
     lines = [
         f"{ours} makes {ratio:.1f} times the moves of the non-anticipative, geometric mean over {len(pairs)} cells.",
         "",
-        f"The two limits at {RATIO:g} times plain MPC's error, in percent of its moves, in four scenarios.",
+        f"The two limits at {RATIO:g} times plain MPC's error, in percent of its moves, in four scenarios. Where a "
+        "controller made fewer moves in these than the search found, its moves are the limit.",
         "",
         "| plant | load | " + " | ".join(names) + " |",
         "|---|---|" + "---|" * len(names),
