@@ -241,6 +241,24 @@ def test_back_from_manual_there_is_no_bump(rules):
             np.testing.assert_allclose(u, by_hand, atol=1e-3)
 
 
+@pytest.mark.parametrize("error", [ZeroDivisionError, np.linalg.LinAlgError])
+def test_a_plan_that_fails_in_its_arithmetic_holds_the_inputs_and_the_loop_goes_on(error, monkeypatch):
+    controller = mampc.MPC(tank_problem())
+    x, y = np.zeros(controller.problem.model.n_states), controller.problem.model.y_op + 1.0
+    state = controller.initial_state()
+    usual = controller.step(state, x, y)
+
+    def fails(*_):
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mampc.MPC, "plan", fails)
+        decision = controller.step(state, x, y)
+    assert decision.status is mampc.Status.HELD_SOLVER_FAILED
+    np.testing.assert_array_equal(decision.u, state.inputs[-1])
+    np.testing.assert_array_equal(controller.step(decision.state, x, y).u, usual.u)
+
+
 @EITHER
 @pytest.mark.parametrize("rules", [None, mampc.MoveRules(price=0.01)])
 @pytest.mark.parametrize("told", [None, mampc.Limits(u_max=60.0)])

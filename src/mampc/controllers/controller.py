@@ -198,7 +198,10 @@ class Controller(ABC):
                 plan = Plan(None, Status.HELD_INFEASIBLE, 0)
             else:
                 sample = self._with_later_data(limits_now.applied_to(sample), hypotheses)
-                plan = self._plan_from(state, sample, limits_now)
+                try:
+                    plan = self._plan_from(state, sample, limits_now)
+                except (ArithmeticError, np.linalg.LinAlgError):  # numbers that no method foresaw end no loop
+                    plan = Plan(None, Status.HELD_SOLVER_FAILED, 0)
         if plan.moves is None or sample is None:
             plan = self._to_hold(plan, sample, state, limits_now.inputs)
         elif plan.objective is None or plan.inputs is None or self._may_leave(limits_now):
