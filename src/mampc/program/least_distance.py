@@ -96,6 +96,7 @@ class LeastDistance:
         self.even = np.concatenate([1 / self._per_violation, even])
         self._f = np.concatenate([cost.linear * self._per_violation, np.zeros(k)])
         self._ordinary = bool(self._f.dot(self._f) <= ORDINARY**2)
+        self._every = np.vstack([np.eye(v, v + k), self._A])  # the violations' own bounds and the rows
         self._of_scale: dict[float, tuple[Array, Array]] = {}
         self._nothing = np.zeros(v + len(A))
         self._nothing.setflags(write=False)
@@ -220,9 +221,8 @@ class LeastDistance:
         `distances` of the bounds, as `distances` gives them.
         """
         pull, v, (low, high) = multipliers / self.even, self._v, distances
-        gradient = pull[v:].dot(self._A)
+        gradient = pull.dot(self._every)
         gradient += self._f
-        gradient[:v] += pull[:v]
         excess = -0.25 * gradient.dot(gradient) - pull.dot(np.where(pull > 0, high, low))
         return -0.5 * gradient[v:], float(excess)
 

@@ -91,7 +91,16 @@ class Sample(Optimum):
         later_data: what patterns forgo of later measurements, where plans count on these; else None.
     """
 
-    __slots__ = ("_constant", "bounds_now", "distances", "frozen", "later_data", "parameter", "u_previous")
+    __slots__ = (
+        "_constant",
+        "_cost",
+        "bounds_now",
+        "distances",
+        "frozen",
+        "later_data",
+        "parameter",
+        "u_previous",
+    )
 
     def __init__(
         self,
@@ -107,11 +116,18 @@ class Sample(Optimum):
         self.later_data: LaterData | None = None
         self._margins: Array | None = None
         self._constant: float | None = None
+        self._cost: float | None = None
         self.distances: tuple[Array, Array] | None = None
         if bounds_now is not None:
             data[parts.lower], data[parts.upper] = bounds_now.lower, bounds_now.upper
             self._margins = bounds_now.margins(data[parts.moves])
         data.setflags(write=False)  # and with it every view that is handed out
+
+    @property
+    def cost(self) -> float:
+        if self._cost is None:
+            self._cost = super().cost
+        return self._cost
 
     @property
     def target(self) -> Array:

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from mampc.base.checks import Array
+from mampc.base.checks import Array, BoolArray
 from mampc.methods.exact.ranking import Ranking
 from mampc.moves.admissible import Allowance
 from mampc.program.sample import Indices, LeastSquares, Sample
 
-FLAT = 1e-300  # of a curvature: what stands for none
+FLAT = 1e-100  # of a curvature: what stands for none
 
 
 class OpenPatterns:
@@ -29,28 +29,25 @@ class OpenPatterns:
         ranking: the table.
         sample, past: its data, and what the past allows.
         bounds: without limits, as `Ranking` gives them for all patterns that the past allows.
-        first: the cost with limits priced in by the first multipliers; None where there are none.
 
     Attributes:
         rows: of the table, shape (K,).
         bounds: on what each costs, shape (K,).
     """
 
-    def __init__(
-        self, ranking: Ranking, sample: Sample, past: Allowance, bounds: Array, first: LeastSquares | None
-    ) -> None:
+    def __init__(self, ranking: Ranking, sample: Sample, past: Allowance, bounds: Array) -> None:
         self._ranking, self._sample = ranking, sample
-        if first is not None:
-            bounds = np.maximum(bounds, ranking.priced(first, past, sample.later_data))
-        of_table = ranking.rows(past)
-        self.rows, self.bounds = np.arange(of_table.start, of_table.start + len(bounds)), bounds
-        self._first: LeastSquares | None = sample.least_squares if first is None else first
-        n = ranking.condensed.n_moves
-        # Per multipliers so far: x, D, level; and per pattern their x' T x - |D|^2.
-        self._x, self._shift, self._level = np.empty((0, n)), np.empty((0, n)), np.empty(0)
-        self._square = np.empty((0, len(bounds)))
-        self._table, self._charge = ranking.squares[of_table], ranking.charges(of_table, sample.later_data)
-        self._rounding = 0.0
+        self._of_table = ranking.rows(past)
+        self.rows: Indices = np.arange(self._of_table.start, self._of_table.start + len(bounds))
+        self.bounds = bounds
+        # All of these once multipliers are priced in: the open part of the table and prices; per multipliers x, D and
+        # the level; and per multipliers and pattern x' T x - |D|^2.
+        self._table: Array | None = None
+        self._charge: Array
+        self._x: Array
+        self._shift: Array
+        self._level: Array
+        self._square: Array
 
     def best(self) -> tuple[int, float]:
         """The position of the pattern with the least bound, and that: infinite when none is left."""
@@ -72,20 +69,37 @@ class OpenPatterns:
     def price(self, cost: LeastSquares, cutoff: float) -> None:
         """Bound with other multipliers as well; patterns that cannot cost less than the cutoff are left out."""
         open_ = self.bounds < cutoff
-        if 2 * np.count_nonzero(open_) < len(open_):
+        if self._table is None:
+            self._begin(open_)
+        elif 2 * np.count_nonzero(open_) < len(open_):
             self.rows, self.bounds, self._charge = self.rows[open_], self.bounds[open_], self._charge[open_]
             self._table, self._square = self._table[open_], self._square[:, open_]
-        if self._first is not None:
-            first, self._first = self._first, None
-            self._take(first)
+        if not len(self.rows):
+            return
         values = self._take(cost)
         values += self._charge
         if self._ranking.admissible.sized:
             values += self._ranking.lift(self._x[-1:], self.rows)[:, 0]
         np.maximum(self.bounds, values, out=self.bounds)
 
+    def _begin(self, open_: BoolArray) -> None:
+        """Take the open patterns' part of the table, and no multipliers as the first ones."""
+        ranking, sample = self._ranking, self._sample
+        without = ranking.excess(sample.moves, self._of_table)
+        if 2 * np.count_nonzero(open_) < len(open_):
+            self.rows, self.bounds, without = self.rows[open_], self.bounds[open_], without[open_]
+            self._table = ranking.squares[self.rows]
+        else:
+            self._table = ranking.squares[self._of_table]
+        self._charge = ranking.charges(self.rows, sample.later_data)
+        x = ranking.scaled(sample.least_squares)
+        self._x, self._shift, self._level = x[None], np.zeros((1, len(x))), np.array([[sample.cost]])
+        self._square = without[None]
+        self._rounding = 2 * ranking.rounding(x)
+
     def _take(self, cost: LeastSquares) -> Array:
         """Take up some multipliers; what patterns cost at least with them, and on the way to earlier ones."""
+        assert self._table is not None
         ranking, (K, n) = self._ranking, self._table.shape[:2]
         x, shift = ranking.scaled(cost), cost.target - self._sample.target
         moved = float(shift.dot(shift))
@@ -95,26 +109,22 @@ class OpenPatterns:
         square = of_x.dot(x)
         square -= moved
         values = square + (level - self._rounding)
-        if len(self._level):
-            # With s of the way: (1 - s)^2 square + 2 s (1 - s) across + s^2 (that of the earlier ones).
-            slope = self._x.dot(of_x.T)
-            slope -= self._shift.dot(shift)[:, None]
-            slope -= square
-            curvature = self._square - square
-            slope *= 2
-            curvature -= slope
-            slope += (self._level - level)[:, None]
-            with np.errstate(over="ignore"):
-                share = slope / np.minimum(curvature, -FLAT)
-            share *= -0.5
-            np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
-            curvature *= share
-            curvature += slope
-            curvature *= share
-            values += np.maximum(curvature.max(axis=0), 0.0)
+        # With s of the way: (1 - s)^2 square + 2 s (1 - s) across + s^2 (that of the earlier ones).
+        slope = self._x.dot(of_x.T)
+        slope -= self._shift.dot(shift)[:, None]
+        slope -= square
+        curvature = self._square - square
+        slope *= 2
+        curvature -= slope
+        slope += self._level - level
+        share = slope / np.minimum(curvature, -FLAT)
+        share *= -0.5
+        np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
+        curvature *= share
+        curvature += slope
+        curvature *= share
+        values += np.maximum(curvature.max(axis=0), 0.0)
         self._x, self._shift = np.concatenate((self._x, x[None])), np.concatenate((self._shift, shift[None]))
-        self._level, self._square = (
-            np.append(self._level, level),
-            np.concatenate((self._square, square[None])),
-        )
+        self._level = np.concatenate((self._level, [[level]]))
+        self._square = np.concatenate((self._square, square[None]))
         return np.asarray(values)

@@ -83,7 +83,7 @@ class Ranking:
         """
         x = free * self.condensed.lengths
         rows = self.rows(past)
-        values: Array = self.table[rows].dot(x.take(self._rows) * x.take(self._columns))
+        values = self.excess(free, rows)
         values += least - self.rounding(x)
         if self.admissible.priced:
             values += self.charge[rows]
@@ -93,6 +93,12 @@ class Ranking:
             values += self.lift(x[None], rows)[:, 0]
         if any(past.frozen):
             values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
+        return values
+
+    def excess(self, free: Array, rows: slice) -> Array:
+        """What optima without limits cost more than the free one, shape (rows,)."""
+        x = free * self.condensed.lengths
+        values: Array = self.table[rows].dot(x.take(self._rows) * x.take(self._columns))
         return values
 
     def priced(self, cost: LeastSquares, past: Allowance, later_data: LaterData | None = None) -> Array:

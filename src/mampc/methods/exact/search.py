@@ -169,11 +169,12 @@ class ExactSearch:
     ) -> Plan:
         """Patterns of the table best bound first, bounded anew whenever a program shows other multipliers."""
         best, deadline, condensed = Incumbent(), self._deadline(), self.condensed
-        rounding, first = condensed.rounding(sample), None
+        rounding, open_ = condensed.rounding(sample), OpenPatterns(ranking, sample, past, bounds)
         if sample.margins.min(initial=np.inf) < 0:
-            plain = condensed.plain.solve(sample.moves, sample.lower, sample.upper)
+            plain = condensed.plain.nearest(sample.target, sample.both_bounds)
             first = _priced(condensed, sample, plain.multipliers)
-        open_ = OpenPatterns(ranking, sample, past, bounds, first)
+            if first is not None:
+                open_.price(first, np.inf)
         relaxation = None if self._relaxation is None else self._relaxation.at(sample, sample.moves)
         while True:
             at, bound = open_.best()
@@ -186,9 +187,11 @@ class ExactSearch:
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
             open_.close(at)
-            limits, cutoff = _priced(condensed, sample, solved.multipliers), best.objective
+            cutoff = best.objective - tie(best.objective, rounding)
+            if open_.best()[1] >= cutoff:
+                continue
+            limits = _priced(condensed, sample, solved.multipliers)
             if limits is not None:
-                cutoff -= tie(cutoff, rounding)
                 open_.price(limits, cutoff)
                 # What limits moves that this pattern does not make shows with those of the best ones left together.
                 if relaxation is not None and len(few := open_.first(TOGETHER)):
@@ -224,6 +227,6 @@ class ExactSearch:
 
 def _priced(condensed: CondensedQP, sample: Sample, multipliers: Array | None) -> LeastSquares | None:
     """The cost with limits priced in by multipliers, if any is not zero."""
-    if multipliers is None or not multipliers.any():
+    if multipliers is None or not multipliers.dot(multipliers) > 0:
         return None
     return condensed.priced(sample, multipliers)
