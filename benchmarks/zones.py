@@ -2,11 +2,13 @@
 
     python benchmarks/zones.py            # prints the figures of docs/methods.md; about a minute
     python benchmarks/zones.py --figure   # and draws docs/images/zones.svg
+    python benchmarks/zones.py --plant tank    # the same on the quadruple tank; or level
     python benchmarks/zones.py --times    # only how long steps take, against those with set points, on the tank
 
-A first-order plant, its model exact, with measurement noise sigma and loads at its output that jump at random. Outputs
-are to be within two sigma of their reference. Set point, zones of that width and of half of it, each with a price per
-move, over the same seeds; the price goes through the values of `PRICES`.
+A first-order plant, its model exact (or the quadruple tank as identified, or the level as linearised, which
+integrates), with measurement noise sigma and loads at its output that jump at random. Outputs are to be within
+two sigma of their reference. Set point, zones of that width and of half of it, each with a price per move, over
+the same seeds; the price goes through the values of `PRICES`.
 """
 
 from __future__ import annotations
@@ -25,7 +27,6 @@ import mampc
 from measuring import closed_loop, interleaved, steps_of, tank_problem
 
 SIGMA = 0.1
-WIDTH = 2 * SIGMA
 PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
 SEEDS = 40
 STEPS = 200
@@ -43,29 +44,50 @@ class Outcome(NamedTuple):
     error: float
 
 
-def outcome(name: str, price: float, **zone: float) -> Outcome:
-    """One controller over all seeds."""
+class Case(NamedTuple):
+    """A plant with its model, noise, and unmeasured loads that jump at random."""
+
+    plant: object
+    model: mampc.StateSpace
+    sigma: float
+    load: mampc.loads.RandomSteps
+    limits: mampc.Limits
+    seeds: int
+    horizon: int = 20
+    move_weight: float = 0.01
+
+
+def case(name: str) -> Case:
+    """A case by the name of its plant."""
+    if name == "tank":
+        model, plant = tank_problem().model, mampc.plants.QuadrupleTank()
+        load = mampc.loads.RandomSteps(at="input", size=2.0, every=600.0)
+        return Case(plant, model, 0.1, load, mampc.Limits(u_min=0.0, u_max=100.0), 6, 15, 0.03)
+    if name == "level":
+        plant = mampc.plants.Level()
+        model = mampc.linearise(plant).discretise(plant.dt)
+        load = mampc.loads.RandomSteps(at="input", size=4.0, every=900.0)
+        return Case(plant, model, 0.01, load, mampc.Limits(u_min=0.0, u_max=100.0), 12, 20, 1e-6)
     model = mampc.StateSpace.from_first_order(gain=[[1.0]], time_constant=[[8.0]], dt=1.0)
+    return Case(model, model, SIGMA, LOAD, mampc.Limits(u_min=-10.0, u_max=10.0), SEEDS)
+
+
+def outcome(of: Case, name: str, price: float, width: float) -> Outcome:
+    """One controller over all seeds, with a zone of so many sigma, at a price in units of a hundred sigma squared."""
     problem = mampc.TrackingProblem(
-        model, prediction_horizon=20, control_horizon=3, tail_horizon=20.0, move_weight=0.01,
-        limits=mampc.Limits(u_min=-10.0, u_max=10.0), **zone,
+        of.model, prediction_horizon=of.horizon, control_horizon=3, tail_horizon=of.horizon, limits=of.limits,
+        move_weight=of.move_weight, zone_below=width * of.sigma, zone_above=width * of.sigma,
     )  # fmt: skip
-    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(price=price)))
+    rules = mampc.MoveRules(price=100 * price * of.sigma**2)
     batch = mampc.simulate_batch(
-        model,
-        regulator,
-        model.y_op,
-        steps=STEPS,
-        seeds=range(SEEDS),
-        noise=SIGMA,
-        loads=[LOAD],
-        progress=False,
-    )
+        of.plant, mampc.Regulator(mampc.MAMPC(problem, rules)), of.model.y_op, steps=STEPS, seeds=range(of.seeds),
+        noise=of.sigma, loads=[of.load], progress=False,
+    )  # fmt: skip
     inputs = np.concatenate([batch.u_initial[:, None], batch.u], axis=1)
     moves = (np.abs(np.diff(inputs, axis=1)) > 1e-9).sum(axis=(1, 2))
-    outside = (np.abs(batch.y - batch.r) > WIDTH).mean(axis=(1, 2))
+    outside = (np.abs(batch.y - batch.r) > 2 * of.sigma).mean(axis=(1, 2))
     return Outcome(
-        name, price, float(moves.mean()), float(outside.mean()), float(outside.std() / np.sqrt(SEEDS))
+        name, price, float(moves.mean()), float(outside.mean()), float(outside.std() / np.sqrt(of.seeds))
     )
 
 
@@ -114,18 +136,16 @@ def main() -> None:
     )
     parser.add_argument("--figure", action="store_true", help="draw docs/images/zones.svg as well")
     parser.add_argument("--times", action="store_true", help="only compare times of steps")
+    parser.add_argument("--plant", choices=["first-order", "tank", "level"], default="first-order")
     arguments = parser.parse_args()
     if arguments.times:
         times()
         return
-    kinds = {
-        "set point": {},
-        "zone of two sigma": {"zone_below": WIDTH, "zone_above": WIDTH},
-        "zone of one sigma": {"zone_below": WIDTH / 2, "zone_above": WIDTH / 2},
-    }
+    kinds = {"set point": 0.0, "zone of two sigma": 2.0, "zone of one sigma": 1.0}
+    of = case(arguments.plant)
     every = [(name, price) for name in kinds for price in PRICES]
     found = [
-        outcome(name, price, **kinds[name])
+        outcome(of, name, price, kinds[name])
         for name, price in track(every, "zones", console=Console(stderr=True))
     ]
     fronts = {name: [o for o in found if o.name == name] for name in kinds}
@@ -137,7 +157,9 @@ def main() -> None:
         table.add_row(o.name, f"{o.price:g}", f"{o.moves:.1f}", outside, equal)
     Console(width=110).print(table)
     if arguments.figure:
-        draw(fronts)
+        draw(fronts) if arguments.plant == "first-order" else parser.error(
+            "the figure is of the first-order plant"
+        )
 
 
 if __name__ == "__main__":

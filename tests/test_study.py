@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from mampc.report.folder import ResultFolder
 from mampc.report.output import run_and_write
 from mampc.report.summary import summarise
 from mampc.report.tables import comparison_tables
-from mampc.study import builtin_studies, load_study, parse_study, run_study, template
+from mampc.study import Study, builtin_studies, load_study, parse_study, run_study, template
+from mampc.study.loading import _table_of
 
 SHORT = template().replace("steps = 145", "steps = 20").replace("prbs_order = 8", "prbs_order = 6")
 SHORT = SHORT.replace("at = 50", "at = 12").replace("at = 100", "at = 16")
@@ -299,3 +301,45 @@ def test_a_path_outside_the_studys_folder_is_refused(result, tmp_path):
     (tmp_path / "inner" / "study.toml").write_text(text)
     with pytest.raises(mampc.StudyError, match="within the study's folder"):
         run_study(load_study(tmp_path / "inner" / "study.toml"))
+
+
+def keys_of(table, seen=()):
+    """Every key that a study may have, with those of the tables in it."""
+    for name, field in table.model_fields.items():
+        yield name
+        inner = _table_of(field.annotation)
+        if inner is not None and inner not in seen:
+            yield from keys_of(inner, (*seen, inner))
+
+
+def test_the_template_shows_every_key():
+    text = template()
+    missing = {key for key in keys_of(Study) if not re.search(rf"\b{key}\b", text)}
+    assert missing <= {"place"}
+
+
+def test_what_the_template_shows_in_comments_can_be_said():
+    """Zones that change, ranks, resting values, banks and switches, all at once."""
+    text = template().replace("steps = 145", "steps = 60").replace("at = 100", "at = 55")
+    for key in (
+        "zone_below",
+        "zone_above",
+        "output_rank",
+        "u_target",
+        "u_target_weight",
+        "u_cost",
+        "zones",
+        "switches",
+    ):
+        assert re.search(rf"^# {key} = ", text, re.M), key
+        text = re.sub(rf"^# {key} = ", f"{key} = ", text, flags=re.M)
+    text = re.sub(r"^#   value, or one per output; inf.*$", "", text, flags=re.M)
+    bank = text[text.index("# [[controllers]]") :]
+    text = text.replace(bank, re.sub(r"^# ", "", bank, flags=re.M)).replace(
+        'variant = "brisk"', 'variant = "exact price"'
+    )
+    study = parse_study(text)
+    assert study.controllers[-1].variants == ["MPC", "exact price"]
+    assert study.scenarios[-1].switches[0].variant == "exact price"
+    assert study.reference.zones[0].above == [0.2, np.inf]
+    assert study.problem.output_rank == [1, 2]
