@@ -28,7 +28,10 @@ RULES = {
 
 
 def regulator(problem, rules=None, disturbance="output", **settings):
-    controller = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules, **settings)
+    if rules is None:
+        controller = mampc.MPC(problem)
+    else:  # without a limit of time, which a busy machine would reach in one run and not in the other
+        controller = mampc.MAMPC(problem, rules, **(settings or {"time_limit": None}))
     estimator = mampc.KalmanFilter.offset_free(problem.model, disturbance=disturbance)
     return mampc.Regulator(controller, estimator)
 
