@@ -10,6 +10,7 @@ import typer
 from mampc.base.errors import MampcError, shown
 from mampc.cli.app import app
 from mampc.cli.console import bar, complain, console_for_tables
+from mampc.cli.options import Jobs, Points, Scheduler, Seeds, SweepFolder, Trust, Yes
 
 if TYPE_CHECKING:
     from mampc.compare.sweep import Sweep
@@ -20,21 +21,14 @@ LARGE_SWEEP = 20_000  # runs of a sweep that asks first
 @app.command()
 def sweep(
     study: Annotated[str, typer.Argument(help="A built-in study or a TOML file.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME-sweep.")
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=10_000, help="Of noise and loads, in every scenario.")] = 8,
-    points: Annotated[int, typer.Option(min=1, max=1000, help="Values of each controller's knob.")] = 9,
+    out: SweepFolder = None,
+    seeds: Seeds = 8,
+    points: Points = 9,
     table: Annotated[str, typer.Option(help="Name of the table; .csv or .parquet.")] = "sweep.csv",
-    jobs: Annotated[int, typer.Option(help="Processes; -1 for one a core.")] = -1,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes here."),
-    ] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Run a large grid without asking.")] = False,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant.")
-    ] = False,
+    jobs: Jobs = -1,
+    scheduler: Scheduler = None,
+    yes: Yes = False,
+    trust: Trust = False,
 ) -> None:
     """Run every controller of a study over the values of its knob, in every scenario, under many seeds.
 
@@ -59,20 +53,13 @@ def sweep(
 @app.command()
 def front(
     study: Annotated[str, typer.Argument(help="A built-in study or a TOML file.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME-sweep.")
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=10_000, help="Of noise and loads, in every scenario.")] = 8,
-    points: Annotated[int, typer.Option(min=1, max=1000, help="Values of each controller's knob.")] = 9,
-    jobs: Annotated[int, typer.Option(help="Processes; -1 for one a core.")] = -1,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes here."),
-    ] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Run a large grid without asking.")] = False,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant.")
-    ] = False,
+    out: SweepFolder = None,
+    seeds: Seeds = 8,
+    points: Points = 9,
+    jobs: Jobs = -1,
+    scheduler: Scheduler = None,
+    yes: Yes = False,
+    trust: Trust = False,
 ) -> None:
     """Which controller needs the fewest moves at equal tracking error? Runs the sweep, then draws and tabulates.
 

@@ -10,6 +10,7 @@ import typer
 from mampc.base.errors import MampcError
 from mampc.cli.app import app
 from mampc.cli.console import complain, console_for_tables, progress
+from mampc.cli.options import Trust
 
 
 @app.command()
@@ -18,9 +19,7 @@ def run(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME.")
     ] = None,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
-    ] = False,
+    trust: Trust = False,
 ) -> None:
     """Run a study: identify a model, close the loop with every controller, compare.
 
@@ -65,9 +64,7 @@ def replay(
     tolerance: Annotated[
         float, typer.Option(help="Of inputs and objectives, relative to their size; 0 for the same bits.")
     ] = 1e-9,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant (module:Class).")
-    ] = False,
+    trust: Trust = False,
 ) -> None:
     """Decide again on the recorded measurements of a run, and find the first decision that differs.
 

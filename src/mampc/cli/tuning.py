@@ -10,6 +10,7 @@ import typer
 from mampc.base.errors import MampcError, shown
 from mampc.cli.app import app
 from mampc.cli.console import bar, complain, console_for_tables, progress
+from mampc.cli.options import Jobs, Trust
 
 LARGEST_INCREASE = 10.0  # of the error; more is a percentage without its sign
 
@@ -31,10 +32,8 @@ def tune(
         Path | None, typer.Option("--out", "-o", help="Folder for the results; default results/NAME-tuned.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal results.")] = 0,
-    jobs: Annotated[int, typer.Option(help="Processes; -1 for one a core.")] = -1,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Allow a study from elsewhere to import its plant.")
-    ] = False,
+    jobs: Jobs = -1,
+    trust: Trust = False,
 ) -> None:
     """Which controller moves least often at the error that you allow? Give one number.
 
