@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import mampc
 from mampc import IOData, n4sid, prbs
 from mampc.identification.closed_loop import under_feedback
 from mampc.identification.scaling import scaled
-from seeds import examples
+from seeds import examples, seeds
 
 PLANTS = {  # A, B, C and a feedback that stabilises them
     "one pole": ([[1.05]], [[0.5]], [[1.0]], [[0.4]]),
@@ -84,3 +85,47 @@ def test_a_controller_on_the_model_of_an_unstable_plant_holds_it():
         plant, mampc.Regulator(mampc.MPC(problem)), [4.0], steps=200, input_disturbance=[0.5], progress=False
     )
     np.testing.assert_allclose(run.y[-10:], 4.0, atol=0.01)
+
+
+LOADS = {"slow": [1, -0.98], "quick": [1, -0.8], "swinging": [1, -1.9, 0.92]}
+PI_GAIN, PI_TIME, LAG, LATE = 0.6, 5.0, 5.0, 2  # times in samples
+
+
+def under_pi(load, seed, *, samples=2500, units=(1.0, 1.0)):
+    """A first-order plant of gain 2 under a PI controller, with loads at its output and a small test at its input."""
+    rng = np.random.default_rng(seed)
+    size = {"slow": 0.1, "quick": 0.3, "swinging": 0.05}[load]
+    loads = lfilter([1.0], LOADS[load], size * rng.standard_normal(samples))
+    test = 0.5 * prbs(order=10, hold=8, samples=samples, seed=seed)[:, 0]
+    pole, x, total = np.exp(-1 / LAG), 0.0, 0.0
+    u, y = np.zeros(samples), np.zeros(samples)
+    for k in range(samples):
+        y[k] = x + loads[k] + 0.05 * rng.standard_normal()
+        total -= PI_GAIN * y[k] / PI_TIME
+        u[k] = total - PI_GAIN * y[k] + test[k]
+        x = pole * x + 2 * (1 - pole) * (u[k - LATE] if k >= LATE else 0.0)
+    return IOData((u + 50) * units[0], (y + 20) * units[1], 60.0)
+
+
+@pytest.mark.parametrize("seed", seeds(6, quick=1))
+@pytest.mark.parametrize("load", LOADS)
+def test_gains_of_a_plant_under_control_are_its_own(load, seed):
+    fitted = n4sid(under_pi(load, seed), feedthrough=False)
+    gain = fitted.model.dc_gain()[0, 0]
+    assert fitted.detrend == "whitened"
+    assert "past outputs moved the inputs" in " ".join(fitted.notes)
+    assert gain == pytest.approx(2.0, rel=0.25)
+    response = fitted.model.step_response(30)[:, 0, 0]
+    true = np.array([2 * (1 - np.exp(-max(k - LATE, 0) / LAG)) for k in range(30)])
+    np.testing.assert_allclose(response[1:], true[:-1], atol=0.5)
+
+
+def test_units_decide_nothing_under_control():
+    one, other = (
+        n4sid(under_pi("slow", 3, units=units), feedthrough=False) for units in ((1, 1), (1e-7, 1e6))
+    )
+    assert one.detrend == other.detrend
+    np.testing.assert_allclose(other.model.dc_gain() * 1e-13, one.model.dc_gain(), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.sort_complex(other.model.poles()), np.sort_complex(one.model.poles()), atol=1e-6
+    )

@@ -137,7 +137,7 @@ def identify(
     detrend: Annotated[
         str,
         typer.Option(
-            help="none, constant, linear or differences; auto takes what predicts held-out data best."
+            help="none, constant, linear, differences or whitened; auto takes what predicts held-out data best."
         ),
     ] = "auto",
     share: Annotated[float, typer.Option(help="Part of the record to estimate on; the rest validates.")] = 2

@@ -35,8 +35,15 @@ NEAR_BEST = 1.02  # simulation errors that are as good as equal
 LITTLE = 0.2  # a filter's pole that makes no difference
 EQUATIONS, LEAST = 15_000, 1000  # in which orders are compared, and samples
 SIGNIFICANT = 4.0  # a square of two standard deviations
-DEGREES = {"none": -1, "constant": 0, "linear": 1, "differences": -1}  # of the trend that is fitted
-PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0}  # of the trend taken off Hankel rows
+FILTERED = ("differences", "whitened")  # trends after whose filter nothing is left of levels
+DEGREES = {
+    "none": -1,
+    "constant": 0,
+    "linear": 1,
+    "differences": -1,
+    "whitened": 0,
+}  # of the trend that is fitted
+PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0, "whitened": 0}  # taken off Hankel rows
 
 Dynamics = Callable[[int], tuple[Array, Array]]  # A and C of an order
 
@@ -118,7 +125,7 @@ def finished(
     if few is not seen:
         part = part._replace(fit=fitted(part.A, part.C))
     part = _with_integrators(part, *dynamics(len(part.A)), seen, settings.unstable, fitted)
-    if trend == "differences":
+    if trend in FILTERED:
         return _on_levels(part, own)
     return _without_idle_constant(part, seen, settings.feedthrough) if trend == "constant" else part
 

@@ -32,6 +32,7 @@ TRENDS = {
     "constant": "constants were fitted",
     "linear": "a line in time was fitted to each output",
     "differences": "changes were explained, as outputs that drift ask for",
+    "whitened": "disturbances were made white first, as their colour or a loop that was closed ask for",
 }
 UNSTABLE = (
     "The record was taken under feedback and shows poles outside the unit circle for certain; they were kept."
@@ -54,10 +55,10 @@ class Identified:
         integrators: how many poles are exactly one.
         delays: dead times in samples, shape (l, m + d), beyond the one of every sampled plant; they are
             shift registers among the model's states.
-        detrend: what was done about drifts, one of "none", "constant", "linear", "differences".
+        detrend: what was done about drifts, one of "none", "constant", "linear", "differences", "whitened".
         notes: what was found and decided, in sentences.
         fit: percent per output, shape (l,), of the simulated model on the (first) record itself, a line in
-            time set aside if `detrend` is "linear" or "differences".
+            time set aside unless `detrend` is "none" or "constant".
         stabilised: True if poles were moved inside the unit circle.
     """
 
@@ -94,7 +95,7 @@ class Identified:
 
     def validate(self, data: IOData) -> Validation:
         """Simulate the model on another record, drifts set aside as they were here; see `mampc.validate`."""
-        return validate(self.model, data, drift=self.detrend in ("linear", "differences"))
+        return validate(self.model, data, drift=self.detrend not in ("none", "constant"))
 
 
 def n4sid(
@@ -127,7 +128,8 @@ def n4sid(
             them where a record taken under feedback shows them for certain, and mirrors them elsewhere.
         detrend: "none" explains the signals as they are, "constant" (beside the means) and "linear" fit a
             constant or a line in time to each output of each record, "differences" explains changes from
-            sample to sample; "auto" takes what predicts held-out data best, the simplest if that is alike.
+            sample to sample, "whitened" makes disturbances white first, one output after the other; "auto" takes what
+            predicts held-out data best, the simplest if that is alike, "whitened" if outputs moved the inputs.
         delays: dead times in samples, beyond the one of every sampled plant, a scalar or (l, m + d); by
             default those that show in the record, if they exceed `SHORT` and predict held-out data.
         progress: is told each stage in a few words; long records with many signals take some seconds.
@@ -151,12 +153,13 @@ def n4sid(
     dead = _given_delays(delays, l, m, min(lengths))
     tell = progress if progress is not None else (lambda stage: None)
     values: list[Array] = []
-    if unstable == "auto" and detrend != "none" and dead is None and _keeps_unstable(records, settings):
+    feedback = detrend != "none" and _under_feedback(records)
+    if unstable == "auto" and dead is None and feedback and _keeps_unstable(records, settings):
         choice = _Choice("constant", np.zeros((l, m), dtype=int), predictor=True, notes=(UNSTABLE,))
         part, errors_ahead = estimate_predictor(records, feedthrough, order)
         parts, noise = [part], Noise(np.maximum(errors_ahead, LEAST_NOISE) * records.y_spread, np.zeros(l))
     else:
-        choice = _chosen(records, settings, detrend, dead, tell)
+        choice = _chosen(records, settings, detrend, dead, feedback, tell)
         tell("identifying a model on all of the record")
         parts = _parts(records, settings, choice, values)
         noise = _noise(parts, records)
@@ -165,7 +168,7 @@ def n4sid(
     notes = list(choice.notes)
     if integrators:
         notes.append(f"Poles that the record cannot tell from one were made exactly one: {integrators}.")
-    quality = validate(model, first, drift=choice.trend in ("linear", "differences"))
+    quality = validate(model, first, drift=choice.trend not in ("none", "constant"))
     return Identified(
         model=model,
         x0=quality.x0,
@@ -223,11 +226,18 @@ class _Estimate:
         return assembled(parts, records, self.like).step_response(samples)
 
 
+def _under_feedback(records: Scaled) -> bool:
+    """Whether past outputs moved the inputs."""
+    try:
+        return under_feedback(records.shortened(ENOUGH))
+    except np.linalg.LinAlgError:
+        return False
+
+
 def _keeps_unstable(records: Scaled, settings: Settings) -> bool:
     """Whether a record under feedback shows poles outside the unit circle for certain."""
     try:
-        few = records.shortened(ENOUGH)
-        return under_feedback(few) and certainly_unstable(few, settings.feedthrough, settings.order)
+        return certainly_unstable(records.shortened(ENOUGH), settings.feedthrough, settings.order)
     except np.linalg.LinAlgError:
         return False
 
@@ -251,7 +261,7 @@ def _parts(
     """The parts of a model, of given orders if any; appends the singular values of each."""
     if choice.predictor:
         return [estimate_predictor(records, settings.feedthrough, None if orders is None else orders[0])[0]]
-    if choice.rival:
+    if choice.rival or choice.trend == "whitened":
         return estimate_arx(records, choice.delays, settings, choice.trend, orders)
     parts = []
     for k, (outputs, delays) in enumerate(groups(choice.delays)):
@@ -264,8 +274,9 @@ def _parts(
 
 
 def _chosen(
-    records: Scaled, settings: Settings, detrend: str, delays: Integers | None, tell: Callable[[str], None]
-) -> _Choice:
+    records: Scaled, settings: Settings, detrend: str, delays: Integers | None, feedback: bool,
+    tell: Callable[[str], None],
+) -> _Choice:  # fmt: skip
     """Trend, dead times and rival by what predicts the held-out part of the records."""
     m, l = records.u[0].shape[1], records.y[0].shape[1]
     none = np.zeros((l, m), dtype=int)
@@ -282,38 +293,45 @@ def _chosen(
             s = _block_rows([len(u) - int(choice.delays.max()) for u in front.u], m, l, settings.order, None)
             trial = replace(settings, block_rows=min(s, settings.block_rows))
             parts = _parts(front, trial, choice)
-        except MampcError:
+        except (MampcError, np.linalg.LinAlgError):
             return _Score(np.inf, 0.0, np.inf, 0, 0)
-        return _Score(
-            *errors(parts, back), sum(part.integrators for part in parts), sum(len(part.A) for part in parts)
-        )
+        found = errors(parts, back, coloured=feedback)
+        return _Score(*found, sum(part.integrators for part in parts), sum(len(part.A) for part in parts))
 
-    trends = ("constant", "linear", "differences") if detrend == "auto" else (detrend,)
+    trends = ("constant", "linear", "differences", "whitened") if detrend == "auto" else (detrend,)
     choices = [_Choice(trend, found) for trend in trends]
     scores = [scored(choice) for choice in choices]
     if not any(np.isfinite(score.error) for score in scores):
         why = "Too short to hold a part out, so that nothing was compared"
         return _Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
     # A drift passes for an integrator or a slow mode that inputs hardly move: the fewest of these win, and among
-    # equals changes are explained where what is left of levels walks, else the simplest.
+    # equals changes are explained where what is left of levels walks, else the simplest. Noise is made white only
+    # where it is not, as levels say nothing then. They say nothing under feedback either: inputs answer disturbances.
     first = scores[0]
-    fair = [
-        k
-        for k, score in enumerate(scores)
-        if k == 0
-        or (score.level <= first.level + CLEARLY and score.states <= first.states)
-        or score.error < first.error - CLEARLY
-    ]
+
+    def is_fair(k: int) -> bool:
+        score = scores[k]
+        if feedback:
+            return bool(np.isfinite(score.error))
+        if trends[k] == "whitened":
+            return min(score.walk, first.walk) > WALK and score.level <= first.level + CLEARLY
+        simple = score.level <= first.level + CLEARLY and score.states <= first.states
+        return k == 0 or simple or score.error < first.error - CLEARLY
+
+    fair = [k for k in range(len(trends)) if is_fair(k)]
     least = min(scores[k].error for k in fair)
     near = [k for k in fair if scores[k].error <= least + AS_GOOD]
     walks = scores[near[0]].walk > WALK
 
-    def rank(k: int) -> tuple[int, int, bool, int]:
-        return scores[k].integrators, scores[k].states, walks and trends[k] != "differences", k
+    def rank(k: int) -> tuple[bool, int, int, bool, int]:
+        white = feedback and trends[k] != "whitened"
+        return white, scores[k].integrators, scores[k].states, walks and trends[k] != "differences", k
 
     best = min(near, key=rank)
     choice, score = choices[best], scores[best].error
     said = f"Trend: {TRENDS[choice.trend]}"
+    if feedback:
+        said += "; past outputs moved the inputs"
     if best:
         said += f"; this predicts held-out data {compared(score, scores[0].error)} constants"
     notes.append(f"{said}.")
@@ -326,7 +344,7 @@ def _chosen(
             notes.append(
                 f"Dead times of {spans} samples; they predict held-out data {compared(score, without)} none."
             )
-    if settings.order is None:
+    if settings.order is None and choice.trend != "whitened":
         rival = scored(replace(choice, rival=True)).error
         wins = rival < score - RIVAL
         choice = replace(choice, rival=wins)

@@ -1,0 +1,98 @@
+"""Disturbances of any colour, and records under feedback: the noise is made white before a model is estimated.
+
+An ARX model with many coefficients, A(q) y = B(q) u + e, predicts without bias under feedback too, and A(q) makes the
+disturbance white. What A(q) leaves of inputs and output is explained by the same plant with white noise: simulation
+errors of that are prediction errors, the most certain ones, also where past outputs moved the inputs.
+
+Source: Zhu and Hjalmarsson, The Box-Jenkins Steiglitz-McBride algorithm, Automatica 65 (2016).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.identification.scaling import Scaled
+from mampc.identification.triangular import fold, solve
+
+LONGEST = 30  # coefficients of the filter
+ITERATIONS = 30
+SETTLED = 1e-6  # change of a coefficient
+EDGE = 1 - 1e-9  # largest pole
+EACH = 20  # samples for each coefficient of the ARX model, at least
+
+
+def prewhitened(records: Scaled, first: int) -> Scaled:
+    """Inputs and the one output through A(q) of a long ARX model."""
+    m = records.u[0].shape[1]
+    lags = max(2, min(LONGEST, records.samples // (EACH * (m + 1)), min(map(len, records.u)) // 4))
+    a = denominator(records.u, records.y, lags, 0, first)
+    return replace(
+        records,
+        u=tuple(_filtered(u, a) for u in records.u),
+        y=tuple(_filtered(y, a) for y in records.y),
+    )
+
+
+def denominator(u: Sequence[Array], y: Sequence[Array], n: int, degree: int, first: int = 0) -> Array:
+    """a_1 .. a_n of y[k] = sum a_i y[k - i] + sum b_ij u_j[k - i] + trend.
+
+    Inputs count from the lag `first` on: under feedback, those of the same sample know the disturbance.
+    """
+    R: Array = np.empty((0, 0))
+    for inputs, output in zip(u, y, strict=True):
+        N = len(output) - n
+        time = np.arange(N) / N - 0.5
+        columns: list[Array] = [time[:, None] ** np.arange(degree + 1)]
+        columns += [inputs[n - i : n - i + N] for i in range(first, n + 1)]
+        columns += [output[n - i : n - i + N] for i in range(1, n + 1)]
+        rows = np.concatenate([*columns, output[n:]], axis=1)
+        own = degree + 1
+        R = fold(R if R.size else np.empty((0, rows.shape[1] - own)), _reduced(rows, own))
+    return solve(R)[-n:]
+
+
+def _reduced(rows: Array, own: int) -> Array:
+    """Rows without their first columns, which are projected off."""
+    return fold(np.empty((0, rows.shape[1])), rows)[own:, own:]
+
+
+def refined(a: Array, records: Scaled, first: int) -> Array:
+    """A denominator for white noise at the output, by the iterations of Steiglitz and McBride from a first one.
+
+    Its poles are kept inside the unit circle.
+    """
+    from scipy.signal import lfilter
+
+    a = _stable(a)
+    for _ in range(ITERATIONS):
+        recursion = np.concatenate([[1.0], -a])
+        u, y = (
+            [lfilter([1.0], recursion, signal, axis=0) for signal in signals]
+            for signals in (records.u, records.y)
+        )
+        found = _stable(denominator(u, y, len(a), 0, first))
+        if np.abs(found - a).max() < SETTLED:
+            return found
+        a = found
+    return a
+
+
+def _stable(a: Array) -> Array:
+    """Poles outside the unit circle mirrored to its inside."""
+    poles = np.roots(np.concatenate([[1.0], -a]))
+    size = np.maximum(np.abs(poles), 1e-300)
+    inside = np.where(size > EDGE, poles / size * np.minimum(1 / size, EDGE), poles)
+    stable: Array = -np.real(np.poly(inside))[1:]
+    return np.concatenate([stable, np.zeros(len(a) - len(stable))])  # leading zeros have no roots
+
+
+def _filtered(signal: Array, a: Array) -> Array:
+    """signal[k] - sum a_i signal[k - i], from the first sample with a whole past on."""
+    from scipy.signal import lfilter
+
+    whole: Array = lfilter(np.concatenate([[1.0], -a]), [1.0], signal, axis=0)
+    return whole[len(a) :]
