@@ -12,7 +12,7 @@ import mampc
 from builders import identified_tank, random_model, tank_problem
 from mampc import Hypothesis, LoadBank, LoadKind
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
-from mampc.loop.load_bank import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
+from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.noise import Noise
 from mampc.systems.riccati import predicted_covariance, seen_covariance
 

@@ -25,21 +25,13 @@ from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
 from mampc.loop.estimation import Estimate, Estimator, Updated
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
+from mampc.loop.mixing import Mixing
 from mampc.program.problem import TrackingProblem
 from mampc.systems.state_space import StateSpace
 
-STAYS = 0.998  # chance that a load goes on as it does
-TO_JUMP = 0.001  # chance that it jumps; what is left goes to the other hypotheses
-JUMP_GOES_ON = 0.3  # chance that a jump takes one more sample
-FORGETS = 0.01  # share by which a sample counts in what usually holds
-LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
 NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
-NOISE_REMEMBERED = 100.0  # and of what is seen of it
-NOISE_RANGE = (0.01, 100.0)  # of the variance, beside what was told
-UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
-IMPOSSIBLE = 1e-300  # no hypothesis is less likely, so that some are left whatever comes
 SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
@@ -130,16 +122,18 @@ class LoadBank(Estimator):
             raise MampcError(f"LoadBank: {error}") from None
         self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
         self._planning_model = self.loads.with_fading(self._kept) if self._kept else model
-        self._jumps = np.array([h.load is LoadKind.JUMPS for h in self.hypotheses])
-        self._lasts = np.where(self._jumps & ~self._jumps.all(), 0.0, 1.0)
-        self._ones = np.ones(len(self.hypotheses))
-        self._chances, self._returns = _chances(self._jumps)
+        self._mixing = Mixing(np.array([h.load is LoadKind.JUMPS for h in self.hypotheses]))
+        self._per_output = np.ones(model.n_outputs)
         self._A = np.stack([member.A for member in self.members])
         self._C = np.stack([member.C for member in self.members])
         self._plans = np.stack([self.to_plan(b) for b in range(len(self.members))])
+        l, m = model.n_outputs, model.n_inputs
+        self._parts = slice(0, -m - l), slice(-m - l, -l), slice(-l, None)  # x, d_u and d_y in these
         self._mixture = np.vstack([plan.T for plan in self._plans])
         self._filters: dict[bytes, Filters] = {}
         self._all = np.ones(model.n_outputs, dtype=bool)
+        self._everything = self.filters(self._all)
+        self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         self._of_states, self._of_known = self._everyday()
         size = self._of_known.shape[0] * self._of_states.shape[0] * self._of_states.shape[2]
         self._together = None if size > SMALL else np.hstack([_diagonal(self._of_states), self._of_known])
@@ -203,10 +197,9 @@ class LoadBank(Estimator):
 
     def loads_of(self, estimate: Estimate) -> Array:
         """The loads of the mixture, shape (k,), in sizes that show in the outputs like their noise."""
-        bank, n = _bank(estimate), self.model.n_states
-        loads: Array = np.einsum(
-            "...b,...bz->...z", bank.weights, bank.members[..., n : n + self.loads.count]
-        )
+        bank, members = _bank(estimate), _bank(estimate).members[..., self._of_loads]
+        one = bank.weights.ndim == 1
+        loads: Array = bank.weights.dot(members) if one else np.einsum("sb,sbz->sz", bank.weights, members)
         return loads
 
     def with_loads(self, estimate: Estimate, stuck: BoolArray, loads: Array) -> Estimate:
@@ -236,9 +229,9 @@ class LoadBank(Estimator):
             free = left[:, np.count_nonzero(size > 1e-9 * size.max(initial=0.0)) :].T  # whatever x is
             w = np.linalg.lstsq(free @ of_w, free @ wanted, rcond=1e-9)[0]
             x = np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
-        usual = self._lasts / self._lasts.sum()
+        usual = self._mixing.lasts / self._mixing.lasts.sum()
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
-        return self._estimate(members, usual @ self._chances, usual, np.array([1.0, self._told]))
+        return self._estimate(members, usual @ self._mixing.chances, usual, np.array([1.0, self._told]))
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
@@ -246,7 +239,7 @@ class LoadBank(Estimator):
         known = np.concatenate((u, v_last, v, y, _ONE))
         if not is_usable(known) or not is_usable(bank.members.ravel()):
             return None
-        c, mixed = self._mixed(bank)
+        c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
         n_z, l = mixed.shape[1], len(y)
         if self._together is None:
             each = np.matmul(self._of_states, mixed[:, :, None])[:, :, 0].ravel() + self._of_known.dot(known)
@@ -256,7 +249,7 @@ class LoadBank(Estimator):
             return None
         each = each.reshape(len(c), -1)
         seen = c.dot(each[:, n_z:-l])  # innovation and movement of the mixture
-        estimate = self._weighed(each[:, :n_z], c, bank, each[:, -l:], self.filters(self._all))
+        estimate = self._weighed(each[:, :n_z], c, bank, each[:, -l:], self._everything)
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
@@ -264,12 +257,12 @@ class LoadBank(Estimator):
         bank = _bank(last)
         known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1))), axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
-            c, mixed = self._mixed(bank)
+            c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
             n_z, l, hypotheses = mixed.shape[2], y.shape[1], len(self.members)
             each = np.matmul(self._of_states, mixed[..., None])[..., 0]
             each += (known @ self._of_known.T).reshape(len(y), hypotheses, -1)
             seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:-l])
-            estimate = self._weighed(each[:, :, :n_z], c, bank, each[:, :, -l:], self.filters(self._all))
+            estimate = self._weighed(each[:, :, :n_z], c, bank, each[:, :, -l:], self._everything)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
     def _everyday(self) -> tuple[Array, Array]:
@@ -296,7 +289,7 @@ class LoadBank(Estimator):
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since."""
         bank, model = _bank(last), self.model
-        c, mixed = self._mixed(bank)
+        c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
         members = np.matmul(self._A, mixed[:, :, None])[:, :, 0]
         members[:, : model.n_states] += model.B @ self._change(u, v)
         return self._estimate(members, c, bank.usual, bank.scale)
@@ -334,36 +327,21 @@ class LoadBank(Estimator):
             filters = self._filters[key] = Filters(gains, whiten, log_scale, int(believed.sum()))
         return filters
 
-    def _mixed(self, bank: BankEstimate) -> tuple[Array, Array]:
-        """How likely each hypothesis is now, before the measurement, (..., B); and where its filter starts."""
-        joint = bank.weights[..., None] * (self._chances + self._returns[:, None] * bank.usual[..., None, :])
-        c = np.maximum(self._ones @ joint, IMPOSSIBLE)
-        return c, np.matmul(joint.swapaxes(-1, -2), bank.members) / c[..., None]
-
     def _weighed(
         self, members: Array, c: Array, bank: BankEstimate, white: Array, filters: Filters
     ) -> BankEstimate:
         """The estimate after Bayes' rule, from the innovations made white, shape (..., B, l)."""
-        surprise = np.einsum("...bi,...bi->...b", white, white)
-        likelihood = filters.log_scale - 0.5 * surprise / bank.scale[..., :1]
-        if likelihood.ndim == 1:
-            weights = c * np.exp(likelihood - likelihood[likelihood.argmax()])
-        else:
-            weights = c * np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
-        weights /= weights.dot(self._ones)[..., None]
-        usual = np.maximum((1 - FORGETS) * bank.usual + FORGETS * weights, LEAST) * self._lasts
-        usual /= usual.dot(self._ones)[..., None]
-        if not filters.believed:
-            return self._estimate(members, weights, usual, bank.scale)
-        shown = np.einsum("...b,...b->...", weights, surprise) / filters.believed
-        return self._estimate(members, weights, usual, _rescaled(bank.scale, shown))
+        surprise = np.square(white).dot(self._per_output)
+        after = self._mixing.one if surprise.ndim == 1 else self._mixing.many
+        return self._estimate(
+            members, *after(c, surprise, filters.log_scale, filters.believed, bank.usual, bank.scale)
+        )
 
     def _estimate(self, members: Array, weights: Array, usual: Array, scale: Array) -> BankEstimate:
-        shape = (*weights.shape[:-1], -1)
-        plan = (weights[..., None] * members).reshape(shape).dot(self._mixture)
-        l, m = self.model.n_outputs, self.model.n_inputs
+        plan = (weights[..., None] * members).reshape((*weights.shape[:-1], -1)).dot(self._mixture)
+        x, at_inputs, at_outputs = self._parts
         return BankEstimate(
-            plan[..., : -m - l], plan[..., -l:], plan[..., -m - l : -l], members, weights, usual, scale
+            plan[..., x], plan[..., at_outputs], plan[..., at_inputs], members, weights, usual, scale
         )
 
     def _seen(self, members: Array) -> Array:
@@ -378,38 +356,9 @@ class LoadBank(Estimator):
         return change
 
 
-def _rescaled(scale: Array, shown: Array) -> Array:
-    """The scale of a `BankEstimate` after innovations of this squared size, of one loop or of many."""
-    if scale.ndim > 1:
-        variance, seen = scale[:, 0], np.minimum(scale[:, 1] + 1, NOISE_REMEMBERED)
-        variance = variance + (np.minimum(shown, UNUSUAL * variance) - variance) / seen
-        return np.stack([np.clip(variance, *NOISE_RANGE), seen], axis=1)
-    before, samples = scale.tolist()
-    samples = min(samples + 1, NOISE_REMEMBERED)
-    after = before + (min(float(shown), UNUSUAL * before) - before) / samples
-    return np.array((min(max(after, NOISE_RANGE[0]), NOISE_RANGE[1]), samples))
-
-
 def _identified(model: StateSpace) -> Array | None:
     """The noise that an identified model knows of every output, shape (l,), or None."""
     return model.noise.output if model.noise is not None and (model.noise.output > 0).all() else None
-
-
-def _chances(jumps: BoolArray) -> tuple[Array, Array]:
-    """The chances T that do not depend on what usually holds, and what share of each jump returns to that."""
-    if jumps.all() or len(jumps) == 1:
-        return np.eye(len(jumps)), np.zeros(len(jumps))
-    others = np.outer(~jumps, ~jumps) & ~np.eye(len(jumps), dtype=bool)
-    to_jump = np.outer(~jumps, jumps)
-    chances = TO_JUMP * _shared(to_jump) + (1 - STAYS - TO_JUMP) * _shared(others)
-    chances += np.diag(np.where(jumps, JUMP_GOES_ON, 1 - chances.sum(axis=1)))
-    return chances, np.where(jumps, 1 - JUMP_GOES_ON, 0.0)
-
-
-def _shared(places: BoolArray) -> Array:
-    """Every row's chance of one, shared by its places; zeros in rows without any."""
-    count: Array = places.sum(axis=1, keepdims=True).astype(np.float64)
-    return places / np.maximum(count, 1.0)
 
 
 def _diagonal(blocks: Array) -> Array:

@@ -1,0 +1,107 @@
+"""How likely each hypothesis about the load is: before a measurement, and by Bayes' rule after it.
+
+The formulas are those at the top of `load_bank`. Weights mu are (B,), or loops first, (S, B). Beside them stand the
+usual ones, to which jumps return, and the scale: the variance of the innovations beside what the noise told leads to,
+and how many samples have shown it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mampc.base.checks import Array, BoolArray
+
+STAYS = 0.998  # chance that a load goes on as it does
+TO_JUMP = 0.001  # chance that it jumps; what is left goes to the other hypotheses
+JUMP_GOES_ON = 0.3  # chance that a jump takes one more sample
+FORGETS = 0.01  # share by which a sample counts in what usually holds
+LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
+NOISE_REMEMBERED = 100.0  # and of what is seen of it
+NOISE_RANGE = (0.01, 100.0)  # of the variance, beside what was told
+UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
+IMPOSSIBLE = 1e-300  # no hypothesis is less likely, so that some are left whatever comes
+
+
+class Mixing:
+    """The chances that loads begin to behave in another way, and what measurements make of them.
+
+    Args:
+        jumps: which hypotheses say that the load has just jumped, shape (B,).
+
+    Attributes:
+        chances: T as far as it does not depend on what usually holds, shape (B, B).
+        lasts: 1 for hypotheses that may hold usually, 0 for jumps, shape (B,).
+    """
+
+    def __init__(self, jumps: BoolArray) -> None:
+        self.chances, returns = _chances(jumps)
+        self.lasts = np.where(jumps & ~jumps.all(), 0.0, 1.0)
+        self._returns, self._ones = returns[:, None], np.ones(len(jumps))
+        self._least = np.full(len(jumps), LEAST)
+
+    def before(self, weights: Array, usual: Array, members: Array) -> tuple[Array, Array]:
+        """How likely each hypothesis is now, before the measurement, (..., B); and where its filter starts."""
+        joint = weights[..., None] * (self.chances + self._returns * usual[..., None, :])
+        if joint.ndim == 2:  # one loop: `dot` takes half the time of `matmul` here
+            c = np.maximum(self._ones.dot(joint), IMPOSSIBLE)
+            return c, joint.T.dot(members) / c[:, None]
+        c = np.maximum(self._ones @ joint, IMPOSSIBLE)
+        return c, np.matmul(joint.swapaxes(-1, -2), members) / c[..., None]
+
+    def many(
+        self, c: Array, surprise: Array, log_scale: Array, believed: int, usual: Array, scale: Array
+    ) -> tuple[Array, Array, Array]:
+        """Weights, usual ones and scale of many loops after their innovations.
+
+        Args:
+            c: of `before`.
+            surprise: e' S^-1 e of each hypothesis, shape (S, B).
+            log_scale: -1/2 log det S, shape (B,).
+            believed: how many outputs are.
+            usual, scale: at the last sample, shapes (S, B) and (S, 2).
+        """
+        likelihood = log_scale - 0.5 * surprise / scale[:, :1]
+        weights = c * np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+        weights /= weights.dot(self._ones)[:, None]
+        usual = np.maximum((1 - FORGETS) * usual + FORGETS * weights, LEAST) * self.lasts
+        usual /= usual.dot(self._ones)[:, None]
+        if not believed:
+            return weights, usual, scale
+        shown = np.einsum("sb,sb->s", weights, surprise) / believed
+        variance, seen = scale[:, 0], np.minimum(scale[:, 1] + 1, NOISE_REMEMBERED)
+        variance = variance + (np.minimum(shown, UNUSUAL * variance) - variance) / seen
+        return weights, usual, np.stack([np.clip(variance, *NOISE_RANGE), seen], axis=1)
+
+    def one(
+        self, c: Array, surprise: Array, log_scale: Array, believed: int, usual: Array, scale: Array
+    ) -> tuple[Array, Array, Array]:
+        """The same of one loop, shapes (B,), in as few calls as a handful of numbers allow."""
+        variance, samples = scale.tolist()
+        likelihood = log_scale - surprise * (0.5 / variance)
+        weights = c * np.exp(likelihood - likelihood[likelihood.argmax()])
+        weights *= 1 / weights.dot(self._ones)
+        usual = np.maximum(usual * (1 - FORGETS) + weights * FORGETS, self._least) * self.lasts
+        usual *= 1 / usual.dot(self._ones)
+        if not believed:
+            return weights, usual, scale
+        shown = float(weights.dot(surprise)) / believed
+        samples = min(samples + 1, NOISE_REMEMBERED)
+        variance += (min(shown, UNUSUAL * variance) - variance) / samples
+        return weights, usual, np.array((min(max(variance, NOISE_RANGE[0]), NOISE_RANGE[1]), samples))
+
+
+def _chances(jumps: BoolArray) -> tuple[Array, Array]:
+    """The chances T that do not depend on what usually holds, and what share of each jump returns to that."""
+    if jumps.all() or len(jumps) == 1:
+        return np.eye(len(jumps)), np.zeros(len(jumps))
+    others = np.outer(~jumps, ~jumps) & ~np.eye(len(jumps), dtype=bool)
+    to_jump = np.outer(~jumps, jumps)
+    chances = TO_JUMP * _shared(to_jump) + (1 - STAYS - TO_JUMP) * _shared(others)
+    chances += np.diag(np.where(jumps, JUMP_GOES_ON, 1 - chances.sum(axis=1)))
+    return chances, np.where(jumps, 1 - JUMP_GOES_ON, 0.0)
+
+
+def _shared(places: BoolArray) -> Array:
+    """Every row's chance of one, shared by its places; zeros in rows without any."""
+    count: Array = places.sum(axis=1, keepdims=True).astype(np.float64)
+    return places / np.maximum(count, 1.0)
