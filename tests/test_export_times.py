@@ -1,0 +1,261 @@
+"""Times in exports: forms, zones, gaps, jitter, order."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mampc import IOData, MampcError, read_export
+from small_exports import U, Y, assert_whole, read, rows, stamps, text, told, write
+
+pd = pytest.importorskip("pandas")
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d %H:%M:%S+02:00", "%Y/%m/%d %H:%M",
+        "%d.%m.%Y %H:%M:%S", "%d/%m/%Y %H:%M", "%m/%d/%Y %I:%M:%S %p", "%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S.%f",
+        "%d.%m.%y %H:%M", "%b %d %Y %H:%M:%S", "%H:%M:%S", "%Y%m%dT%H%M%S",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["time", "Zeitstempel", "when"])
+def test_time_stamps_under_any_name(tmp_path, form, name):
+    assert_whole(read(tmp_path, text(rows(stamps(form=form)), ";", (name, "u", "y"))))
+
+
+def test_dates_and_times_in_two_columns(tmp_path):
+    lines = [[*time.split(" "), u, y] for time, u, y in rows(stamps(dt=7200.0))]
+    assert_whole(read(tmp_path, text(lines, header=("Date", "Time", "u", "y"))), dt=7200.0)
+
+
+def test_times_of_the_day_that_run_past_midnight_are_refused(tmp_path):
+    with pytest.raises(MampcError, match="have no date and run past midnight"):
+        read(tmp_path, text(rows(stamps(start="2024-04-13 23:55:00", form="%H:%M:%S"))))
+
+
+@pytest.mark.parametrize(
+    ("header", "scale", "options"),
+    [
+        ("time", 1.0, {}),
+        ("elapsed", 1.0, {}),
+        ("Laufzeit", 1.0, {}),
+        ("time [min]", 1 / 60, {}),
+        ("time_ms", 1000.0, {}),
+        ("time", 1 / 3600, {"time_unit": "h"}),
+        ("wann", 1.0, {"time": "wann"}),
+    ],
+)
+def test_numeric_times(tmp_path, header, scale, options):
+    times = [repr(60.0 * k * scale) for k in range(len(U))]
+    assert_whole(read(tmp_path, text(rows(times), header=(header, "u", "y")), **options))
+
+
+def test_unix_times_in_milliseconds_are_known_and_other_large_numbers_refused(tmp_path):
+    assert_whole(read(tmp_path, text(rows([1.7e12 + 60_000 * k for k in range(len(U))]))))
+    compact = stamps(form="%Y%m%d%H%M%S")
+    with pytest.raises(MampcError, match=r"numbers as large as 2024\d+; .*--time-format"):
+        read(tmp_path, text(rows(compact)))
+    assert_whole(read(tmp_path, text(rows(compact)), time_format="%Y%m%d%H%M%S"))
+    days = [repr(45000 + k / 1440) for k in range(len(U))]
+    with pytest.raises(MampcError, match="seconds or days of a spreadsheet"):
+        read(tmp_path, text(rows(days)))
+    assert_whole(read(tmp_path, text(rows(days)), time_unit="d"))
+
+
+def test_a_count_of_rows_is_no_time(tmp_path):
+    with pytest.raises(MampcError, match="expected a column of times"):
+        read(tmp_path, text(rows(range(len(U))), header=("nr", "u", "y")))
+    assert_whole(read(tmp_path, text(rows(range(len(U))), header=("nr", "u", "y")), dt=60.0))
+
+
+def test_day_and_month_are_told_apart_by_even_steps(tmp_path):
+    export = read(tmp_path, text(rows(stamps(dt=86400.0, start="2024-04-01", form="%d/%m/%Y"))))
+    assert_whole(export, 86400.0)
+    assert told(export, "day first: only so are they even")
+    assert told(
+        read(tmp_path, text(rows(stamps(form="%m/%d/%Y %H:%M", start="2024-04-05")))),
+        "the steps are the same",
+    )
+
+
+def local(samples, zone="Europe/Berlin", start="2024-10-27 01:30:00", dt=600.0):
+    times = pd.date_range(start, periods=samples, freq=f"{dt:g}s", tz=zone)
+    return times.strftime("%d.%m.%Y %H:%M:%S").tolist()
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+@pytest.mark.parametrize("options", [{}, {"time_zone": "Europe/Berlin"}])
+def test_the_doubled_hour_in_autumn(tmp_path, options, newest_first):
+    lines = rows(local(len(U)))
+    export = read(tmp_path, text(lines[::-1] if newest_first else lines), **options)
+    assert_whole(export, 600.0)
+    assert bool(options) or told(export, "the clock goes back an hour", "end of summer time")
+
+
+@pytest.mark.parametrize("twice", [3, 4])
+def test_an_hourly_row_that_stands_twice_on_a_sunday_night_is_not_the_doubled_hour(tmp_path, twice):
+    lines = rows(stamps(dt=3600.0, start="2024-04-13 22:00:00"))
+    export = read(tmp_path, text(lines[: twice + 1] + lines[twice:]))
+    assert_whole(export, 3600.0)
+    assert told(export, f"times stand more than once in row {twice + 3}")
+
+
+def test_the_doubled_hour_of_hourly_rows(tmp_path):
+    times = pd.date_range("2024-10-26 22:00", periods=len(U), freq="h", tz="Europe/Berlin")
+    export = read(tmp_path, text(rows(times.strftime("%d.%m.%Y %H:%M").tolist())))
+    assert_whole(export, 3600.0)
+
+
+def test_the_missing_hour_in_spring_is_a_gap_unless_the_zone_is_known(tmp_path):
+    content = text(rows(local(len(U), start="2024-03-31 01:00:00")))
+    assert len(read(tmp_path, content).records) == 2
+    assert_whole(read(tmp_path, content, time_zone="Europe/Berlin"), 600.0)
+
+
+def test_doubled_times_that_nothing_tells_apart_are_not_used(tmp_path):
+    lines = sorted(rows(local(len(U))))
+    with pytest.raises(MampcError, match=r"received \d+ of \d+ times more than once"):
+        read(tmp_path, text(lines))
+    with pytest.raises(MampcError, match="doubled hour at the end of summer time"):
+        read(tmp_path, text(lines), time_zone="Europe/Berlin")
+
+
+def test_offsets_from_utc_count(tmp_path):
+    times = pd.date_range("2024-10-27 01:30", periods=len(U), freq="600s", tz="Europe/Berlin")
+    assert_whole(read(tmp_path, text(rows([time.isoformat() for time in times]))), 600.0)
+    mixed = [
+        time.isoformat() if k % 2 else time.strftime("%Y-%m-%d %H:%M:%S") for k, time in enumerate(times)
+    ]
+    with pytest.raises(MampcError, match="have an offset from UTC"):
+        read(tmp_path, text(rows(mixed)))
+
+
+def test_a_sample_time_that_contradicts_the_times_is_refused(tmp_path):
+    with pytest.raises(MampcError, match="dt: expected 60 s, the step of column 'time', received 10 s"):
+        read(tmp_path, text(rows()), dt=10.0)
+    assert_whole(read(tmp_path, text(rows()), dt=60.0))
+
+
+def test_gaps_split_the_record_and_are_told(tmp_path):
+    lines = rows()
+    export = read(tmp_path, text(lines[:5] + lines[7:]))
+    assert [len(record) for record in export.records] == [5, 5]
+    assert export.starts == ("2024-04-13 09:58:00", "2024-04-13 10:05:00")
+    assert told(export, "1 gap", "2 after row 6 (2024-04-13 10:02:00)")
+    np.testing.assert_array_equal(export.records[1].y[:, 0], Y[7:])
+
+
+def test_one_record_is_asked_for_and_several_are_there(tmp_path):
+    lines = rows()
+    path = write(tmp_path, text(lines[:5] + lines[7:]))
+    with pytest.raises(
+        MampcError, match=r"received 2 pieces of 5, 5 samples .*read_export\(\.\.\.\)\.records"
+    ):
+        IOData.from_csv(path, inputs="u", outputs="y")
+
+
+@pytest.mark.parametrize("order", ["backwards", "mixed"])
+def test_rows_out_of_order_are_put_in_order_and_told(tmp_path, order):
+    lines = rows()
+    if order == "backwards":
+        lines = lines[::-1]
+    else:
+        lines[2], lines[7] = lines[7], lines[2]
+    export = read(tmp_path, text(lines))
+    assert_whole(export)
+    assert told(export, "put in order")
+
+
+def test_rows_that_stand_twice_count_once_and_contradictions_not_at_all(tmp_path):
+    lines = rows()
+    export = read(tmp_path, text([*lines[:4], lines[3], *lines[4:]]))
+    assert_whole(export)
+    assert told(export, "times stand more than once in row 6")
+    export = read(tmp_path, text([*lines[:4], [lines[3][0], "5.0", "77"], *lines[4:]]))
+    assert [len(record) for record in export.records] == [3, 8]
+    assert told(export, "row 6 contradict")
+    export = read(tmp_path, text([*lines[:4], [lines[3][0], "Bad", ""], *lines[4:]]))
+    assert_whole(export)
+
+
+def test_jitter_is_resampled_and_told(tmp_path):
+    rng = np.random.default_rng(0)
+    n = 400
+    times = 60.0 * np.arange(n) + rng.uniform(-12, 12, n)
+    u = np.repeat(rng.integers(0, 2, n // 8), 8).astype(float)
+
+    def level(t):
+        return 20 + 3 * np.sin(t / 700)
+
+    export = read(
+        tmp_path,
+        text([[repr(float(t)), str(a), repr(float(level(t)))] for t, a in zip(times, u, strict=True)]),
+    )
+    [record] = export.records
+    assert record.dt == 60.0
+    assert told(export, "stray by up to", "resampled")
+    at = times[0] + 60.0 * np.arange(len(record))
+    np.testing.assert_allclose(record.y[:, 0], level(at), atol=0.01)
+    assert np.mean(record.u[: n - 5, 0] == u[: n - 5]) > 0.97
+
+
+def test_next_to_no_jitter_leaves_the_values(tmp_path):
+    export = read(tmp_path, text(rows([60 * k + 0.003 * (k % 3) for k in range(len(U))])))
+    assert_whole(export)
+    assert told(export, "taken as even")
+
+
+def test_a_clock_that_is_a_little_slow_keeps_its_own_step(tmp_path):
+    n = 3000
+    content = text([[repr(10.02 * k), str(k % 7), str(k % 5)] for k in range(n)])
+    export = read(tmp_path, content)
+    assert export.records[0].dt == 10.02
+    [record] = read(tmp_path, content, dt=10.0).records
+    assert (record.dt, len(record)) == (10.0, 3006)
+
+
+def test_uneven_times_are_refused(tmp_path):
+    rng = np.random.default_rng(1)
+    lines = rows(np.cumsum(rng.exponential(60.0, len(U))))
+    with pytest.raises(
+        MampcError, match=r"evenly increasing time column, received in 'time' steps of .* before row"
+    ):
+        read(tmp_path, text(lines))
+
+
+def test_two_columns_of_times_are_asked_about(tmp_path):
+    lines = [[time, other, u, y] for (time, u, y), other in zip(rows(), stamps(dt=61.0), strict=True)]
+    content = text(lines, header=("measured", "stored", "u", "y"))
+    with pytest.raises(MampcError, match="expected one column of times, received 'measured', 'stored'"):
+        read(tmp_path, content)
+    assert_whole(read(tmp_path, content, time="measured"))
+
+
+def test_rows_without_a_time_are_left_out_and_told(tmp_path):
+    lines = rows()
+    lines[4][0] = ""
+    export = read(tmp_path, text(lines))
+    assert [len(record) for record in export.records] == [4, 7]
+    assert told(export, "no time can be read in row 6")
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M:%S.%f"])
+def test_plain_stamps_need_no_pandas_and_say_what_others_say(tmp_path, form):
+    path = write(tmp_path, text(rows(stamps(form=form))))
+    code = (
+        f"import sys, mampc; record = mampc.IOData.from_csv({str(path)!r}, inputs='u', outputs='y'); "
+        "sys.exit('pandas' in sys.modules or record.dt != 60.0)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+    assert_whole(read_export(path, inputs="u", outputs="y", time_format=form))
+
+
+@pytest.mark.parametrize("wrong", ["2024-02-30 10:00:00", "2024-04-13 25:00:00", "", "Total"])
+def test_a_stamp_that_is_none_is_left_out_and_told(tmp_path, wrong):
+    times = stamps()
+    times[11] = wrong
+    export = read(tmp_path, text(rows(times)))
+    assert [len(record) for record in export.records] == [11]
+    assert told(export, "no time can be read in row 13")
