@@ -15,7 +15,8 @@ REFERENCE = [34.0, 28.0]
 def batch_against_loops(name: str, rules: mampc.MoveRules | None, target: float) -> Row:
     """`simulate_batch` of the nonlinear tank with 1000 seeds against `simulate`, per step of one loop."""
     plant, problem = mampc.plants.QuadrupleTank(), tank_problem()
-    loop = mampc.Regulator(mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules))
+    controller = mampc.MPC(problem) if rules is None else mampc.MAMPC(problem, rules)
+    loop = mampc.Regulator(controller, mampc.KalmanFilter.offset_free(problem.model))
     settings = {"steps": SAMPLES, "noise": 0.1, "progress": False}
     one = partial(mampc.simulate, plant, loop, REFERENCE, seed=0, **settings)
     many = partial(mampc.simulate_batch, plant, loop, REFERENCE, seeds=range(SEEDS), **settings)

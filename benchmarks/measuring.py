@@ -100,7 +100,8 @@ def closed_loop(controller: Controller) -> list[Asked]:
     reference = mampc.steps(SAMPLES, y_op, [(k, y_op + change) for k, change in changes])
     controller.step = recording
     try:
-        mampc.simulate(plant, mampc.Regulator(controller), reference, noise=0.1, progress=False)
+        estimator = mampc.KalmanFilter.offset_free(controller.problem.model)
+        mampc.simulate(plant, mampc.Regulator(controller, estimator), reference, noise=0.1, progress=False)
     finally:
         del controller.step
     return asked

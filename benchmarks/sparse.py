@@ -202,7 +202,8 @@ def move_limits_and_a_price() -> Row:
     )  # fmt: skip
     reference = mampc.steps(200, [50, 30, 25], [(50, [50, 40, 25]), (100, [54, 30, 25])])
     disturbance = mampc.steps(200, [20.0], [(150, [25.0])])
-    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(price=2.0)))
+    estimator = mampc.KalmanFilter.offset_free(model)
+    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(price=2.0)), estimator)
     run = mampc.simulate(
         model, regulator, reference, measured_disturbance=disturbance, steps=200, progress=False
     )
@@ -223,7 +224,8 @@ def on_off(horizon: int) -> Row:
     problem = mampc.TrackingProblem(
         plant, prediction_horizon=horizon, control_horizon=horizon, limits=mampc.Limits(u_min=0.0, u_max=1.0)
     )
-    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(min_size=1.0)))
+    estimator = mampc.KalmanFilter.offset_free(plant)
+    regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(min_size=1.0)), estimator)
     run = mampc.simulate(plant, regulator, reference=[8.0], steps=60, u_initial=[0.0], progress=False)
     seconds = np.array([d.solve_time for d in run.decisions])
     proven = float(np.mean([d.status is mampc.Status.OPTIMAL for d in run.decisions]))
