@@ -5,7 +5,8 @@ import pytest
 
 import mampc
 from builders import identified_tank, tank_problem
-from mampc.study import parse_study, run_study, template
+from mampc.study import parse_study, run_study
+from studies import short_study
 
 TANK = mampc.plants.QuadrupleTank()
 PRICES = {"calm": 2.0, "brisk": 0.05}
@@ -89,7 +90,6 @@ def test_many_loops_are_each_as_one_loop():
     np.testing.assert_allclose(batch.u[1], ours.u, atol=1e-9)
 
 
-SHORT = template().replace("steps = 145", "steps = 40").replace("skip = 15", "skip = 0")
 STUDY = """
 [[scenarios]]
 name = "switched"
@@ -113,7 +113,7 @@ variants = ["calm", "plain"]
 
 
 def study(old="", new=""):
-    return parse_study(SHORT[: SHORT.index("[[scenarios]]")] + STUDY.replace(old, new, 1))
+    return parse_study(short_study(STUDY.replace(old, new, 1), steps=40, until="[[scenarios]]", skip=(15, 0)))
 
 
 def test_a_study_switches_where_its_scenario_says_so():

@@ -8,21 +8,15 @@ import pytest
 
 from mampc.compare.fronts import Point, error_ratio
 from mampc.compare.sweep import Sweep, points_of, run_sweep
-from mampc.study import parse_study, template
+from mampc.study import parse_study
+from studies import MPC_AND_PRICE, short_study
 
 pytest.importorskip("plotly", reason="needs plotly, which mampc[report] brings")
 front_page = pytest.importorskip("mampc.report.front_page")
 
-CONTROLLERS = """
-[[controllers]]
-name = "MPC"
-method = "mpc"
-
-[[controllers]]
-name = "exact"
-method = "exact"
-rules = { price = 1.0 }
-
+CONTROLLERS = (
+    MPC_AND_PRICE
+    + """
 [[controllers]]
 name = "bands <b>"
 method = "dead_band"
@@ -33,12 +27,12 @@ name = "never"
 method = "quiet_zone"
 settings = { band = 1e6 }
 """
+)
 
 
 @pytest.fixture(scope="module")
 def sweep():
-    text = template().replace("steps = 145", "steps = 60").replace("at = 100", "at = 40")
-    text = text[: text.index("[[controllers]]")] + CONTROLLERS
+    text = short_study(CONTROLLERS, steps=60, at=(100, 40))
     return Sweep(parse_study(text), seeds=2, points=4)
 
 

@@ -17,30 +17,23 @@ from mampc.compare.fronts import Point, moves_at, non_dominated
 from mampc.compare.knobs import knob_of, variants
 from mampc.compare.sweep import Sweep, points_of, run_sweep
 from mampc.report.fronts import equal_error, write_rows
-from mampc.study import parse_study, template
+from mampc.study import parse_study
 from mampc.study.schema import ControllerTable
+from studies import MPC_AND_PRICE, short_study
 
-CONTROLLERS = """
-[[controllers]]
-name = "MPC"
-method = "mpc"
-
-[[controllers]]
-name = "exact"
-method = "exact"
-rules = { price = 1.0 }
-
+CONTROLLERS = (
+    MPC_AND_PRICE
+    + """
 [[controllers]]
 name = "dead band"
 method = "dead_band"
 settings = { size = 1.0 }
 """
+)
 
 
 def small_text():
-    text = template()
-    text = text[: text.index("[[controllers]]")].replace("steps = 145", "steps = 25")
-    return text.replace("skip = 15", "skip = 0") + CONTROLLERS
+    return short_study(CONTROLLERS, steps=25, skip=(15, 0))
 
 
 def small(**changes):
