@@ -3,6 +3,7 @@
     python benchmarks/zones.py            # prints the figures of docs/methods.md; about a minute
     python benchmarks/zones.py --figure   # and draws docs/images/zones.svg
     python benchmarks/zones.py --plant tank    # the same on the quadruple tank; or level
+    python benchmarks/zones.py --kalman   # with one Kalman filter in place of the load bank
     python benchmarks/zones.py --times    # only how long steps take, against those with set points, on the tank
 
 A first-order plant, its model exact (or the quadruple tank as identified, or the level as linearised, which
@@ -72,15 +73,17 @@ def case(name: str) -> Case:
     return Case(model, model, SIGMA, LOAD, mampc.Limits(u_min=-10.0, u_max=10.0), SEEDS)
 
 
-def outcome(of: Case, name: str, price: float, width: float) -> Outcome:
+def outcome(of: Case, name: str, price: float, width: float, kalman: bool) -> Outcome:
     """One controller over all seeds, with a zone of so many sigma, at a price in units of a hundred sigma squared."""
     problem = mampc.TrackingProblem(
         of.model, prediction_horizon=of.horizon, control_horizon=3, tail_horizon=of.horizon, limits=of.limits,
         move_weight=of.move_weight, zone_below=width * of.sigma, zone_above=width * of.sigma,
     )  # fmt: skip
     rules = mampc.MoveRules(price=100 * price * of.sigma**2)
+    estimator = mampc.KalmanFilter.offset_free(of.model) if kalman else None
+    regulator = mampc.Regulator(mampc.MAMPC(problem, rules), estimator)
     batch = mampc.simulate_batch(
-        of.plant, mampc.Regulator(mampc.MAMPC(problem, rules)), of.model.y_op, steps=STEPS, seeds=range(of.seeds),
+        of.plant, regulator, of.model.y_op, steps=STEPS, seeds=range(of.seeds),
         noise=of.sigma, loads=[of.load], progress=False,
     )  # fmt: skip
     inputs = np.concatenate([batch.u_initial[:, None], batch.u], axis=1)
@@ -136,6 +139,7 @@ def main() -> None:
     )
     parser.add_argument("--figure", action="store_true", help="draw docs/images/zones.svg as well")
     parser.add_argument("--times", action="store_true", help="only compare times of steps")
+    parser.add_argument("--kalman", action="store_true", help="one Kalman filter in place of the load bank")
     parser.add_argument("--plant", choices=["first-order", "tank", "level"], default="first-order")
     arguments = parser.parse_args()
     if arguments.times:
@@ -145,7 +149,7 @@ def main() -> None:
     of = case(arguments.plant)
     every = [(name, price) for name in kinds for price in PRICES]
     found = [
-        outcome(of, name, price, kinds[name])
+        outcome(of, name, price, kinds[name], arguments.kalman)
         for name, price in track(every, "zones", console=Console(stderr=True))
     ]
     fronts = {name: [o for o in found if o.name == name] for name in kinds}
