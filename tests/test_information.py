@@ -162,7 +162,8 @@ def test_it_is_off_by_one_argument_and_refused_where_it_has_no_meaning():
     bank, rules = mampc.LoadBank(problem.model, noise=0.1), mampc.MoveRules(price=1.0)
     assert mampc.Regulator(mampc.MAMPC(problem, rules), bank)._planner.information is None
     with pytest.raises(
-        mampc.MampcError, match="value_of_information: expected a controller MAMPC, received MPC"
+        mampc.MampcError,
+        match="value_of_information: expected a controller MAMPC, or a bank of them, received MPC",
     ):
         mampc.Regulator(mampc.MPC(problem), bank, value_of_information=True)
     with pytest.raises(
