@@ -313,3 +313,18 @@ def test_noise_as_found_in_the_record_is_no_jump():
         problem = mampc.TrackingProblem(model, prediction_horizon=20, control_horizon=3, limits=limits)
         run = mampc.simulate(plant, mampc.Regulator(mampc.MPC(problem)), [2e5], steps=300, noise=200.0)
         assert any(decision.ignored_outputs for decision in run.decisions) == doubted
+
+
+def test_noise_that_a_load_bank_was_told_is_no_jump():
+    """The inputs reach 10, and a tenth of that is less than three standard deviations."""
+    model = mampc.StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=10, control_horizon=2, limits=mampc.Limits(u_min=-5.0, u_max=5.0)
+    )
+    regulator = mampc.Regulator(mampc.MPC(problem), mampc.LoadBank(model, noise=0.4))
+    state = regulator.initial_state()
+    for y in 0.4 * np.random.default_rng(3).standard_normal((300, 1)):
+        decision = regulator.step(state, y, [0.0])
+        assert not decision.ignored_outputs
+        state = decision.state
+    assert regulator.step(state, [8.0], [0.0]).ignored_outputs

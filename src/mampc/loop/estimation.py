@@ -56,9 +56,12 @@ class Estimator(ABC):
 
     Attributes:
         model: the discrete model of the plant.
+        noise: standard deviation of the measurement noise of each output, shape (l,), in output units; None where only
+            ratios count.
     """
 
     model: StateSpace
+    noise: Array | None = None
 
     @property
     def planning_model(self) -> StateSpace:

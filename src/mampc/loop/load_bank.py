@@ -90,6 +90,8 @@ class LoadBank(Estimator):
         MampcError: a continuous model, no noise, or a mode that grows and is not seen in the outputs.
     """
 
+    noise: Array
+
     def __init__(
         self,
         model: StateSpace,

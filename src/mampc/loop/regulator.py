@@ -95,7 +95,7 @@ class Regulator:
         self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
         self.estimator = default_estimator(controller) if estimator is None else estimator
         self.sensors = USUAL_CHECKS if sensors is None else sensors
-        self._sensors = self.sensors.fitted(controller.problem)
+        self._sensors = self.sensors.fitted(controller.problem, self.estimator.noise)
         self._v_shape = (model.n_disturbances,)
         tolerance = None
         if applied_tolerance is not None:

@@ -37,7 +37,7 @@ class Thresholds:
 
     Attributes:
         jump_of_reach: default largest jump, as a share of the reach: what the inputs' whole range does to an output.
-        jump_of_noise: default largest jump at least, in standard deviations of the noise kept with the model.
+        jump_of_noise: default largest jump at least, in standard deviations of the noise, where it is known.
         reach_within: samples within which the inputs reach an output that washes out before its steady state.
         absurd_of_reach: times the reach from the operating point no plant gets; nothing there is ever believed.
         stuck_movement: predicted movement, as a share of the largest jump, that a working sensor shows.
@@ -75,8 +75,8 @@ class SensorChecks:
         y_low, y_high: what the sensors can show, in output units, a scalar or (l,); None for no range.
         largest_jump: distance from its prediction at which a measurement is believed at once, in output
             units, a scalar or (l,). Default: a tenth of what the inputs' whole range does to that output,
-            where that range is finite, and six times the noise kept with the model at least; infinite (no test for
-            jumps and stuck sensors) elsewhere.
+            where that range is finite, and six times the noise at least, as a load bank was told it or as
+            the model keeps it; infinite (no test for jumps and stuck sensors) elsewhere.
         confirm: >= 1, samples after which a jump that stays is believed.
         stuck_after: >= 2, equal samples after which a sensor may be stuck; None for never.
 
@@ -95,9 +95,9 @@ class SensorChecks:
         if self.stuck_after is not None:
             as_whole("stuck_after", self.stuck_after, 2)
 
-    def fitted(self, problem: TrackingProblem) -> Sensors:
-        """The checks for the outputs of one problem."""
-        return Sensors(self, problem)
+    def fitted(self, problem: TrackingProblem, noise: Array | None = None) -> Sensors:
+        """The checks for the outputs of one problem; `noise` (l,) as an estimator was told it, in output units."""
+        return Sensors(self, problem, noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class Judged(NamedTuple):
 class Sensors:
     """`SensorChecks` for one problem; `update` is pure."""
 
-    def __init__(self, checks: SensorChecks, problem: TrackingProblem) -> None:
+    def __init__(self, checks: SensorChecks, problem: TrackingProblem, noise: Array | None = None) -> None:
         l = problem.model.n_outputs
         low, high = (
             as_limit("y_low", checks.y_low, l, -np.inf),
@@ -156,8 +156,10 @@ class Sensors:
         self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
         reach = _reach(problem)
         self._jump = THRESHOLDS.jump_of_reach * reach
-        if problem.model.noise is not None:
-            self._jump = np.maximum(self._jump, THRESHOLDS.jump_of_noise * problem.model.noise.output)
+        if noise is None and problem.model.noise is not None:
+            noise = problem.model.noise.output
+        if noise is not None:
+            self._jump = np.maximum(self._jump, THRESHOLDS.jump_of_noise * noise)
         if checks.largest_jump is not None:
             self._jump = _largest_jump(checks.largest_jump, l)
         self._absurd, self._y_op = THRESHOLDS.absurd_of_reach * reach, problem.model.y_op
