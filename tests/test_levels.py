@@ -197,7 +197,8 @@ def loop_of(method, levels, *, settings=None, rules=None, m=2, **limits):
         limits=mampc.Limits(**({"u_min": -3.0, "u_max": 3.0} | limits)),
     )  # fmt: skip
     rules = mampc.MoveRules(levels=levels, **({"price": 0.05} if rules is None else rules))
-    return mampc.Regulator(mampc.MAMPC(problem, rules, method=method, **(settings or {})))
+    estimator = mampc.KalmanFilter.offset_free(model)  # the same for all methods
+    return mampc.Regulator(mampc.MAMPC(problem, rules, method=method, **(settings or {})), estimator)
 
 
 @pytest.mark.parametrize("method", METHODS)
