@@ -11,6 +11,7 @@ from scipy.linalg import solve_discrete_are
 import mampc
 from builders import identified_tank, random_model, tank_problem
 from mampc import Hypothesis, LoadBank, LoadKind
+from mampc.loop.disturbances import state_sizes
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
 from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.noise import Noise
@@ -46,7 +47,8 @@ def driven(hypothesis, loads):
     inputs = np.zeros((n + 2 * k, k))
     inputs[:n] = INPUT_NOISE * loads.on_states
     Q = sum(part @ part.T for part in (walk, burst, slope, inputs))
-    Q[:n, :n] += 1e-10 * np.trace(inputs @ inputs.T) * np.eye(n)
+    sizes = state_sizes(model.A, inputs[:n], model.C / loads.noise[:, None])
+    Q[:n, :n] += np.diag(1e-10 * np.sum((inputs[:n] / sizes[:, None]) ** 2) * sizes**2)
     return Q
 
 
@@ -188,6 +190,26 @@ def test_units_decide_nothing(rules):
         np.testing.assert_allclose(one.state.estimate.weights, two.state.estimate.weights, atol=1e-6)
         states = [one.state, two.state]
     np.testing.assert_allclose(LoadBank.for_problem(other).noise, of_y * LoadBank.for_problem(problem).noise)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_units_of_states_decide_nothing(name):
+    """Over eight decades: gains in outputs and in loads are the same, of the bank and of the Kalman filter."""
+    model = MODELS[name]
+    n, everything = model.n_states, np.ones(model.n_outputs, dtype=bool)
+    of_x = 10 ** np.random.default_rng(0).uniform(-4, 4, n)
+    scaled = replace(model, A=of_x[:, None] * model.A / of_x, B=of_x[:, None] * model.B, C=model.C / of_x)
+    for one, other in zip(bank_of(model).members, bank_of(scaled).members, strict=True):
+        gain, same = one.gain(everything), other.gain(everything)
+        same[:n] /= of_x[:, None]
+        np.testing.assert_allclose(same, gain, rtol=1e-6, atol=1e-6 * np.abs(gain).max())
+    y = model.y_op + 0.3
+    one, other = (bank_of(each).initial(model.u_op, y) for each in (model, scaled))
+    np.testing.assert_allclose(other.members[:, n:], one.members[:, n:], atol=1e-6)
+    np.testing.assert_allclose(other.members[:, :n] / of_x, one.members[:, :n], atol=1e-6)
+    gain, same = (mampc.KalmanFilter.offset_free(each).gain.copy() for each in (model, scaled))
+    same[:n] /= of_x[:, None]
+    np.testing.assert_allclose(same, gain, rtol=1e-6, atol=1e-6 * np.abs(gain).max())
 
 
 def said(load, samples=300, seed=0):

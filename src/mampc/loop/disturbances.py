@@ -54,6 +54,30 @@ def response_within_reach(model: StateSpace) -> Array:
     return picked
 
 
+def state_sizes(A: Array, driven: Array, C: Array) -> Array:
+    """Units of the states, shape (n,), in which the units that a model happens to have do not count.
+
+    Each is how far what drives the states (n, inputs) takes it within `REACH` samples; where it does not, the change
+    that shows in outputs C (l, n), in units of their noise, by one.
+    """
+    size, seen, moved, shown = np.zeros(len(A)), np.zeros(len(A)), driven, C
+    for _ in range(len(A) + REACH):
+        size, seen = size + np.square(moved).sum(axis=1), seen + np.square(shown).sum(axis=0)
+        moved, shown = A @ moved, shown @ A
+    found = (size > 0) & np.isfinite(size)
+    visible = (seen > 0) & np.isfinite(seen)
+    otherwise = np.where(visible, 1 / np.where(visible, seen, 1.0), 1.0)
+    sizes: Array = np.sqrt(np.where(found, size, otherwise))
+    return sizes
+
+
+def driving_noise(driven: Array, sizes: Array) -> Array:
+    """Covariance (n, n) of what drives the states: `driven` (n, inputs) by white noise, and next to nothing at each."""
+    every = 1e-10 * float(np.square(driven / sizes[:, None]).sum())
+    covariance: Array = driven @ driven.T + every * np.diag(sizes**2)
+    return covariance
+
+
 def alike(response: Array) -> Array:
     """Sizes of the outputs, shape (l,), that are alike beside what the inputs do to them; in output units.
 

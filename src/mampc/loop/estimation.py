@@ -16,7 +16,14 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
-from mampc.loop.disturbances import Directions, alike, directions_of, response_within_reach
+from mampc.loop.disturbances import (
+    Directions,
+    alike,
+    directions_of,
+    driving_noise,
+    response_within_reach,
+    state_sizes,
+)
 from mampc.systems.riccati import predicted_covariance
 from mampc.systems.state_space import StateSpace
 
@@ -218,11 +225,14 @@ class KalmanFilter(Estimator):
         moving = unit if input_noise is None else _positive("input_noise", input_noise, m)
         driven = model.B[:, :m] * moving
         Q = np.zeros((len(A), len(A)))
-        Q[:n, :n] = driven @ driven.T + 1e-10 * np.trace(driven @ driven.T) * np.eye(n)
+        sizes = state_sizes(model.A, driven, model.C / noise[:, None])
+        Q[:n, :n] = driving_noise(driven, sizes)
         Q[n:, n:] = np.diag(directions.sizes(wander / noise) ** 2)
         R = np.diag(noise**2)
+        of_all = np.concatenate([sizes, np.ones(len(A) - n)])
+        units = np.outer(of_all, of_all)
         try:
-            P = predicted_covariance(A, C, Q, R)
+            P = units * predicted_covariance(A * of_all / of_all[:, None], C * of_all, Q / units, R)
         except MampcError as error:
             raise MampcError(f"offset_free: {error}") from None
         return cls(model, directions, P, R)

@@ -19,7 +19,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
-from mampc.loop.disturbances import directions_of, response_within_reach
+from mampc.loop.disturbances import directions_of, driving_noise, response_within_reach, state_sizes
 from mampc.systems.riccati import seen_covariance
 from mampc.systems.state_space import StateSpace
 
@@ -100,6 +100,11 @@ class Loads:
         """What a load adds to the outputs at once, shape (l, k)."""
         return self.at_outputs + self.model.D[:, : self.model.n_inputs] @ self.at_inputs
 
+    @property
+    def state_sizes(self) -> Array:
+        """Units of the states that noise at the inputs gives them, shape (n,)."""
+        return state_sizes(self.model.A, INPUT_NOISE * self.on_states, self.model.C / self.noise[:, None])
+
     def with_fading(self, kept: tuple[float, ...]) -> StateSpace:
         """The model with loads that fade as further states, k for every share that a sample keeps."""
         model, count, fading = self.model, len(kept), np.repeat(kept, self.count)
@@ -141,15 +146,19 @@ class Member:
         )
         self.C = np.hstack([model.C, loads.on_outputs, np.zeros((l, k))])
         driven = INPUT_NOISE * loads.on_states
+        sizes = loads.state_sizes
         burst, fall = hypothesis.burst**2, -(1 - a) * hypothesis.burst**2
         Q = np.zeros_like(self.A)
-        Q[:n, :n] = driven @ driven.T + 1e-10 * np.trace(driven @ driven.T) * np.eye(n)
+        Q[:n, :n] = driving_noise(driven, sizes)
         Q[n:, n:] = np.kron(
             [[hypothesis.walk**2 + burst, fall], [fall, hypothesis.slope**2 - (1 - a) * fall]], same
         )
-        # In units of the noise, so that numbers of all outputs are alike.
+        # In units of the noise and of what drives the states, so that all numbers are alike.
         self.noise = np.diag(loads.noise**2)
-        self.covariance = seen_covariance(self.A, self.C / loads.noise[:, None], Q, np.eye(l))
+        of_z = np.concatenate([sizes, np.ones(2 * k)])
+        units = np.outer(of_z, of_z)
+        scaled = self.A * of_z / of_z[:, None], self.C * of_z / loads.noise[:, None]
+        self.covariance = units * seen_covariance(*scaled, Q / units, np.eye(l))
         self._fastest = max(1.0, float(np.abs(model.poles()).max(initial=0.0)))
         if not self._growth(self.gain(np.ones(l, dtype=bool))) <= 1 + RUNS_AWAY:
             raise MampcError("expected a model whose growing modes are all seen in its outputs")

@@ -223,14 +223,15 @@ class LoadBank(Estimator):
         x = model.steady_state(all_inputs)
         if y is not None:
             # (I - A) x = B change + on_states w and C x = y - y_op - D change - on_outputs w
-            of_x = np.vstack([np.eye(n) - model.A, model.C / self.noise[:, None]])
-            of_w = np.vstack([-loads.on_states, loads.on_outputs / self.noise[:, None]])
+            sizes = loads.state_sizes[:, None]
+            of_x = np.vstack([(np.eye(n) - model.A) / sizes, model.C / self.noise[:, None]]) * sizes.T
+            of_w = np.vstack([-loads.on_states / sizes, loads.on_outputs / self.noise[:, None]])
             surplus = (as_vector("y", y, model.n_outputs) - model.y_op - model.D @ change) / self.noise
-            wanted = np.concatenate([model.B @ change, surplus])
+            wanted = np.concatenate([model.B @ change / sizes[:, 0], surplus])
             left, size, _ = np.linalg.svd(of_x)
             free = left[:, np.count_nonzero(size > 1e-9 * size.max(initial=0.0)) :].T  # whatever x is
             w = np.linalg.lstsq(free @ of_w, free @ wanted, rcond=1e-9)[0]
-            x = np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
+            x = sizes[:, 0] * np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
         usual = self._mixing.lasts / self._mixing.lasts.sum()
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
         return self._estimate(members, usual @ self._mixing.chances, usual, np.array([1.0, self._told]))
