@@ -36,7 +36,9 @@ def cases() -> Iterator[tuple[str, dict[str, Any]]]:
             "on/off, price 0.1": {"levels": mampc.OnOff(), "price": 0.1},
             "on/off, 3 s on, 2 s off": {"levels": TIMES},
         }.items():
-            regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(**rules)))
+            regulator = mampc.Regulator(
+                mampc.MAMPC(problem, mampc.MoveRules(**rules)), mampc.KalmanFilter.offset_free(problem.model)
+            )
             yield (
                 f"{name}, {n}/{n}",
                 {
@@ -58,7 +60,10 @@ def cases() -> Iterator[tuple[str, dict[str, Any]]]:
         "grid of 0.5 %, price 1": {"price": 1.0},
         "grid of 0.5 %, 3 moves in 3 + nc": {"max_moves": 3, "sparsity_horizon": 3},
     }.items():
-        regulator = mampc.Regulator(mampc.MAMPC(problem, mampc.MoveRules(levels=0.5, **rules)))
+        regulator = mampc.Regulator(
+            mampc.MAMPC(problem, mampc.MoveRules(levels=0.5, **rules)),
+            mampc.KalmanFilter.offset_free(problem.model),
+        )
         yield f"tank, {name}", {"plant": tank, "regulator": regulator, "reference": reference, "noise": 0.1}
 
 
