@@ -193,7 +193,8 @@ def by_load(cells: Cells, methods: list[str]) -> str:
             mean([c[method][RATIO].value for c in group]) if all(method in c for c in group) else ""
             for group in groups
         ]
-        lines.append("| " + " | ".join([method, *row]) + " |")
+        if any(row):
+            lines.append("| " + " | ".join([method, *row]) + " |")
     return "\n".join(lines)
 
 
