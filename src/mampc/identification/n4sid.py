@@ -301,7 +301,9 @@ def _chosen(
     trends = ("constant", "linear", "differences", "whitened") if detrend == "auto" else (detrend,)
     choices = [_Choice(trend, found) for trend in trends]
     scores = [scored(choice) for choice in choices]
-    if not any(np.isfinite(score.error) for score in scores):
+    # Where inputs excite too little for anything else, white disturbances say nothing.
+    telling = [score for trend, score in zip(trends, scores, strict=True) if trend != "whitened"] or scores
+    if not any(np.isfinite(score.error) for score in telling):
         why = "Too short to hold a part out, so that nothing was compared"
         return _Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
     # A drift passes for an integrator or a slow mode that inputs hardly move: the fewest of these win, and among
