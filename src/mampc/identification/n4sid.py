@@ -298,9 +298,13 @@ def _chosen(
         found = errors(parts, back, coloured=feedback)
         return _Score(*found, sum(part.integrators for part in parts), sum(len(part.A) for part in parts))
 
-    trends = ("constant", "linear", "differences", "whitened") if detrend == "auto" else (detrend,)
+    trends = ("constant", "linear", "differences") if detrend == "auto" else (detrend,)
     choices = [_Choice(trend, found) for trend in trends]
     scores = [scored(choice) for choice in choices]
+    if detrend == "auto" and (feedback or scores[0].walk > WALK):
+        trends = (*trends, "whitened")
+        choices.append(_Choice("whitened", found))
+        scores.append(scored(choices[-1]))
     # Where inputs excite too little for anything else, white disturbances say nothing.
     telling = [score for trend, score in zip(trends, scores, strict=True) if trend != "whitened"] or scores
     if not any(np.isfinite(score.error) for score in telling):
