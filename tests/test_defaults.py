@@ -81,3 +81,21 @@ def test_a_study_has_the_same_defaults(table, of_mpc, of_price):
         assert made[name].value_of_information == ("value" in table and name == "exact price")
     if "noise" in table:
         np.testing.assert_array_equal(made["exact price"].estimator.noise, [0.2, 0.2])
+
+
+@pytest.mark.parametrize(("price", "bank"), [(0.1, False), (1.0, False), (1.0, True)])
+def test_a_delay_that_the_model_lacks_is_forgiven_by_the_filter_and_at_a_high_price_by_the_bank(price, bank):
+    model, plant = (
+        mampc.StateSpace.from_first_order(gain=[[2.0]], time_constant=[[20.0]], dead_time=[[delay]], dt=1.0)
+        for delay in (0.0, 3.0)
+    )
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=30, control_horizon=4, move_weight=0.1, tail_horizon=30.0,
+        limits=mampc.Limits(u_min=-10.0, u_max=10.0),
+    )  # fmt: skip
+    estimator = LoadBank(model, noise=0.02) if bank else KalmanFilter.offset_free(model)
+    regulator = mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=price)), estimator)
+    reference = mampc.steps(300, [0.0], [(5, [1.0])])
+    run = mampc.simulate(plant, regulator, reference, noise=0.02, seed=1, progress=False)
+    assert not np.diff(run.u[200:], axis=0).any()
+    assert np.abs(run.y[200:] - 1.0).max() < 0.1
