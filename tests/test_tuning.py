@@ -11,7 +11,7 @@ import mampc
 from builders import tank_model
 from mampc.cli import app
 from mampc.compare import candidates, scenarios, tuning
-from mampc.compare.scenarios import even_weight, settling, usual_problem
+from mampc.compare.scenarios import even_weight, scenario_length, settling, usual_problem
 from mampc.compare.tuned_study import study_of_model, with_tuning
 from mampc.study import load_study, parse_study
 from mampc.study.regulators import regulator_of
@@ -145,6 +145,9 @@ def test_the_horizon_covers_what_step_responses_take_to_settle():
     assert settling(lag(time_constant=np.inf)) <= 2
     problem = usual_problem(lag(dead_time=80.0), mampc.Limits(), 1.0)
     assert problem.prediction_horizon == settling(lag()) + 8
+    far = usual_problem(lag(dead_time=600.0), mampc.Limits(u_min=-1.0, u_max=1.0), 1.0)
+    assert far.prediction_horizon == settling(lag()) + 60
+    assert scenario_length(far) == 480
     assert usual_problem(lag(time_constant=1e5), mampc.Limits(), 1.0).prediction_horizon == 60
 
 

@@ -25,7 +25,8 @@ from mampc.systems.state_space import StateSpace
 
 SETTLED = 0.05  # share of a step response's largest value that may be missing where it has settled
 LONGEST_SETTLING = 500  # samples that are looked at
-HORIZONS = (10, 60)  # fewest and most samples of a prediction horizon
+HORIZONS = (10, 60)  # fewest and most samples of a prediction horizon; dead times come on top of the most
+BEGUN = 1e-3  # share of a step response's largest value up to which it is dead time
 FREE_MOVES = 5  # control horizon of plain MPC
 CONDITION = 500.0  # of the program that the move weight of plain MPC aims at, as in dynamic matrix control
 
@@ -115,11 +116,14 @@ def every_kind(model: StateSpace, noise: Array, samples: int) -> tuple[tuple[Loa
 def usual_problem(model: StateSpace, limits: Limits, output_weight: Any) -> TrackingProblem:
     """Plain MPC of a model: the prediction horizon covers what step responses take to settle, in bounded samples.
 
+    What lies behind the longest dead time has to be within it, or no move pays.
+
     The move weight of an input is the curvature of its first move over 500 / nc, with nc the control horizon.
 
     Source of the latter: Shridhar and Cooper, Ind. Eng. Chem. Research 36 (1997).
     """
-    n_p = int(np.clip(settling(model), *HORIZONS))
+    shortest, longest = HORIZONS
+    n_p = int(np.clip(settling(model), shortest, longest + dead_samples(model)))
     n_c = min(FREE_MOVES, n_p)
     settings = {"prediction_horizon": n_p, "control_horizon": n_c, "output_weight": output_weight}
     problem = TrackingProblem(model, **settings, move_weight=1.0, limits=limits)
@@ -147,9 +151,19 @@ def settling(model: StateSpace) -> int:
     return int(np.flatnonzero(off.any(axis=(1, 2))).max(initial=-1)) + 1
 
 
+def dead_samples(model: StateSpace) -> int:
+    """The longest dead time of an output and an input that moves it, in samples."""
+    response = np.abs(model.step_response(LONGEST_SETTLING + 1)[:, :, : model.n_inputs])
+    if not np.isfinite(response).all():
+        return 0
+    begun = (response > BEGUN * response.max(axis=0)).argmax(axis=0)
+    return int(max(begun.max(initial=0) - 1, 0))
+
+
 def scenario_length(problem: TrackingProblem) -> int:
-    """Samples of a scenario."""
-    return int(np.clip(HORIZONS_LONG * problem.prediction_horizon, *LENGTHS))
+    """Samples of a scenario, in which set-points last twice the longest dead time at least."""
+    usual = int(np.clip(HORIZONS_LONG * problem.prediction_horizon, *LENGTHS))
+    return max(usual, 2 * CHANGES * dead_samples(problem.model))
 
 
 @dataclass(frozen=True, eq=False)
