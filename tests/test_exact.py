@@ -354,7 +354,7 @@ def test_a_search_over_signs_that_is_cut_short_says_so_and_offers_what_it_found(
     assert whole.status is QPStatus.OPTIMAL
     statuses = set()
     for most in range(1, 130):
-        cut = PatternSolver(condensed, admissible, most_programs=most).solve(data, pattern)
+        cut = PatternSolver(condensed, admissible).solve(data, pattern, most=most)
         statuses.add(cut.status)
         if cut.moves is not None:
             assert cut.objective >= whole.objective - 1e-9

@@ -8,7 +8,9 @@ import pytest
 import mampc
 from builders import cost_of, random_model, same_decision, tank_problem
 from mampc import MampcError, MoveRules, Status
+from mampc.methods.heuristic import MOST_PROGRAMS
 from mampc.moves.admissible import AdmissiblePatterns
+from mampc.program.restriction import Restriction
 from referees import charge, keeps_rules
 from seeds import examples
 
@@ -132,6 +134,16 @@ def test_an_easy_optimum_is_found(name):
     assert found.objective == pytest.approx(best.objective, rel=1e-9)
     assert (found.moves == best.moves).all()
     assert found.moves.sum() == 1
+
+
+@every_heuristic
+def test_least_sizes_take_a_bounded_number_of_programs(name, monkeypatch):
+    solved, solve = [], Restriction.solve
+    monkeypatch.setattr(Restriction, "solve", lambda *args: solved.append(1) or solve(*args))
+    problem, past, x, reference = sample(5, control_horizon=10)
+    controller = controller_of(problem, MoveRules(min_size=0.4, price=1e-4), name)
+    assert not decide(controller, past, x, reference).held
+    assert len(solved) < 1.1 * MOST_PROGRAMS
 
 
 @every_method

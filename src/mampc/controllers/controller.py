@@ -373,8 +373,8 @@ class Controller(ABC):
             self._while_frozen = PatternSolver(self.condensed, AdmissiblePatterns(MoveRules(), m, n_c))
         solved = self._while_frozen.solve(sample, (np.arange(n_c)[:, None] >= frozen).ravel())
         if solved.moves is None:
-            return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.iterations)
-        return Plan(solved.moves, Status.OPTIMAL, solved.iterations, None, objective=solved.objective)
+            return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.programs)
+        return Plan(solved.moves, Status.OPTIMAL, solved.programs, None, objective=solved.objective)
 
 
 def _described(state: Any) -> str:

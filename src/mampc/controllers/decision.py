@@ -53,7 +53,7 @@ class Decision(NamedTuple):
             penalty, price of the planned moves, and for plans that count on later data what their pattern forgoes of
             these (`moves.information`); not-a-number where nothing was solved.
         lower_bound: no admissible plan costs less; minus infinity where nothing is proven.
-        iterations: solver iterations (MPC) or rounds of the method.
+        iterations: solver iterations (MPC; 1 where inputs that may not move are left out) or rounds of the method.
         solve_time: seconds from call to answer.
         state: the controller's state for the next sample.
         remarks: anything else worth knowing.

@@ -27,7 +27,7 @@ from mampc.program.qp import QPStatus
 from mampc.program.sample import Sample
 
 REFEREE_SECONDS = 1.0  # that a certificate may take, or the question whether there is any plan, per sample
-MOST_PROGRAMS = 100  # on one pattern with least sizes, where only an exact method has to try all signs
+MOST_PROGRAMS = 1000  # of one sample with least sizes, where only an exact method has to try all signs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class HeuristicSearch:
         self.admissible = AdmissiblePatterns(
             rules, problem.model.n_inputs, problem.control_horizon, condensed.input_prefix
         )
-        self._solver = PatternSolver(condensed, self.admissible, most_programs=MOST_PROGRAMS)
+        self._solver = PatternSolver(condensed, self.admissible)
 
     @cached_property
     def _referee(self) -> ExactSearch:
@@ -104,7 +104,7 @@ class HeuristicSearch:
         status: Status = Status.FEASIBLE,
     ) -> Plan:
         """The best plan on the patterns proposed, as an answer; no moves at all is always among them."""
-        best, solved, solver = Incumbent(), None, self._solver.after(inputs)
+        best, solved, solver = Incumbent(MOST_PROGRAMS), None, self._solver.after(inputs)
         try:
             while True:
                 pattern = next(proposals) if solved is None else proposals.send(solved)

@@ -24,6 +24,7 @@ from mampc.program.restriction import Restriction
 from mampc.program.sample import LeastSquares, Sample
 
 CACHE_BYTES = 64e6  # for recent patterns and their solvers
+SHARE = 0.1  # of the programs left, that one pattern may take
 NODES = 200  # of a search over levels, that take about as long as a program
 
 
@@ -33,24 +34,27 @@ class OnPattern(NamedTuple):
     The moves are None where there are none below the cutoff: the objective is then a lower bound.
     Multipliers, shape (n_bounds,) and positive at upper bounds, are those without least sizes of moves.
     The status is TIME_LIMIT where the search over signs was not finished: there may be better moves.
+    `programs` is how many it took.
     """
 
     moves: Array | None
     objective: float
     status: QPStatus
     multipliers: Array | None
-    iterations: int
+    programs: int
 
 
 class Incumbent:
     """The best plan found so far, and the work it took.
 
     `failure` says how a pattern was left without an answer, if any was; `unproven` bounds what such patterns cost.
+    `left_programs`, at first `programs`, is how many more all searches over signs may take.
     """
 
-    __slots__ = ("failure", "moves", "multipliers", "objective", "solved", "unproven")
+    __slots__ = ("failure", "left_programs", "moves", "multipliers", "objective", "solved", "unproven")
 
-    def __init__(self) -> None:
+    def __init__(self, programs: float = np.inf) -> None:
+        self.left_programs = programs
         self.moves: Array | None = None
         self.objective = np.inf
         self.multipliers: Array | None = None
@@ -61,6 +65,7 @@ class Incumbent:
     def offer(self, on_pattern: OnPattern, bound: float = -np.inf) -> bool:
         """Take the moves of a pattern if they are better; says whether they were. `bound`: on their objective."""
         self.solved += 1
+        self.left_programs -= on_pattern.programs
         if on_pattern.status not in (QPStatus.OPTIMAL, QPStatus.INFEASIBLE, QPStatus.TIME_LIMIT):
             self.left(on_pattern.status, max(bound, on_pattern.objective))
         if on_pattern.moves is None or on_pattern.objective >= self.objective:
@@ -79,18 +84,10 @@ class PatternSolver:
 
     Args:
         condensed, admissible: the problem and its rules.
-        most_programs: that a search over signs may take.
     """
 
-    def __init__(
-        self,
-        condensed: CondensedQP,
-        admissible: AdmissiblePatterns,
-        *,
-        most_programs: float = np.inf,
-    ) -> None:
+    def __init__(self, condensed: CondensedQP, admissible: AdmissiblePatterns) -> None:
         self.condensed, self.admissible = condensed, admissible
-        self._most_programs = most_programs
         self._kept: OrderedDict[bytes, Restriction] = OrderedDict()
         self._kept_bytes = 0
         self._levels: LevelSearch | None = None
@@ -179,11 +176,12 @@ class PatternSolver:
         deadline: float = np.inf,
         *,
         within: tuple[Array, Array] | None = None,
+        most: float = np.inf,
     ) -> OnPattern:
         """The best moves that are zero off `pattern`, if their objective is below `cutoff`.
 
         With least sizes, `within` are intervals of the pattern's moves that tell their signs.
-        A search over signs stops at the deadline, of `perf_counter`, or after `most_programs`.
+        A search over signs stops at the deadline, of `perf_counter`, or after `most` programs.
         """
         bounds = self._bounds(sample, pattern)
         if bounds is None:
@@ -196,7 +194,7 @@ class PatternSolver:
             nearest = restriction.nearest(sample.target, both, cutoff - base)
             if nearest.moves is None:
                 excess = restriction.excess(sample.target) if _failed(nearest) else nearest.excess
-                return OnPattern(None, base + excess, nearest.status, nearest.multipliers, nearest.iterations)
+                return OnPattern(None, base + excess, nearest.status, nearest.multipliers, 1)
             return self._answer(sample, pattern, nearest, base + nearest.excess, cutoff)
         optimum = restriction.optimum(sample.target)
         base += restriction.excess(sample.target)
@@ -207,22 +205,24 @@ class PatternSolver:
         nearest = restriction.solve(optimum, lower, upper)
         if nearest.moves is None or base + nearest.excess >= cutoff:
             bound = base if _failed(nearest) else base + nearest.excess
-            return OnPattern(None, bound, nearest.status, nearest.multipliers, nearest.iterations)
+            return OnPattern(None, bound, nearest.status, nearest.multipliers, 1)
         if self._levels is not None:
-            return self._on_levels(sample, pattern, optimum, bounds, nearest.multipliers, cutoff, deadline)
+            return self._on_levels(
+                sample, pattern, optimum, bounds, nearest.multipliers, cutoff, deadline, most
+            )
         sizes = self.admissible.min_size[pattern]
         if not sized or (nearest.moves is optimum and (np.abs(optimum) >= sizes).all()):
             return self._answer(sample, pattern, nearest, base + nearest.excess, cutoff)
         signed = search_signs(
             restriction, nearest, optimum, kept, sizes, SMALLER * self.condensed.move_prefix[pattern],
-            cutoff=cutoff - base, most=self._most_programs, deadline=deadline,
+            cutoff=cutoff - base, most=most, deadline=deadline,
         )  # fmt: skip
         if signed.moves is None:
             excess = max(signed.excess, nearest.excess)  # that without least sizes where a program failed
-            return OnPattern(None, base + excess, signed.status, nearest.multipliers, signed.iterations)
-        of_signs = nearest._replace(moves=signed.moves, iterations=signed.iterations)
+            return OnPattern(None, base + excess, signed.status, nearest.multipliers, signed.programs)
+        of_signs = nearest._replace(moves=signed.moves)
         answer = self._answer(sample, pattern, of_signs, base + signed.excess, np.inf)
-        return answer._replace(status=signed.status)
+        return answer._replace(status=signed.status, programs=signed.programs)
 
     def _on_levels(
         self,
@@ -233,6 +233,7 @@ class PatternSolver:
         multipliers: Array | None,
         cutoff: float,
         deadline: float,
+        most: float,
     ) -> OnPattern:
         """The best moves on a pattern that lead from level to level; those that stay cost nothing."""
         assert self._levels is not None
@@ -241,13 +242,13 @@ class PatternSolver:
         found = self._levels.search(
             sample, pattern, self._all_free, self._past, priced=self.priced(sample, multipliers),
             completed=self._completion(sample, pattern, optimum, bounds) if mixed else None, cutoff=cutoff,
-            deadline=deadline, most=NODES * self._most_programs,
+            deadline=deadline, most=NODES * most,
         )  # fmt: skip
         status = QPStatus.OPTIMAL if found.complete else QPStatus.TIME_LIMIT
         if found.moves is None and found.complete and cutoff == np.inf:
             status = QPStatus.INFEASIBLE
         objective = found.bound if found.moves is None else found.objective
-        return OnPattern(found.moves, objective, status, multipliers, found.visited)
+        return OnPattern(found.moves, objective, status, multipliers, 1 + found.visited // NODES)
 
     def _bounds(self, sample: Sample, pattern: BoolArray) -> tuple[Array, Array] | None:
         """The bounds that hold on a pattern; None where it cannot keep them."""
@@ -259,9 +260,9 @@ class PatternSolver:
         self, sample: Sample, pattern: BoolArray, nearest: Nearest, objective: float, cutoff: float
     ) -> OnPattern:
         """Moves of the pattern, shape (its moves,), as an answer; those that are none after all cost nothing."""
-        chosen, multipliers, iterations = nearest.moves, nearest.multipliers, nearest.iterations
+        chosen, multipliers = nearest.moves, nearest.multipliers
         if chosen is None or objective >= cutoff:
-            return OnPattern(None, objective, QPStatus.OPTIMAL, multipliers, iterations)
+            return OnPattern(None, objective, QPStatus.OPTIMAL, multipliers, 1)
         moves: Array = np.zeros(self.condensed.n_moves)
         moves[pattern] = chosen
         if (np.abs(chosen) < ROUNDING * self.condensed.move_prefix[pattern]).any():
@@ -270,23 +271,32 @@ class PatternSolver:
                 sample.later_data is None
             ):  # with it the pattern counts: what later data decide may be nothing as yet
                 objective = self.condensed.cost(sample, moves) + self.admissible.charge(moves != 0)
-        return OnPattern(moves, objective, QPStatus.OPTIMAL, multipliers, iterations)
+        return OnPattern(moves, objective, QPStatus.OPTIMAL, multipliers, 1)
 
     def offer(
         self, sample: Sample, pattern: BoolArray, best: Incumbent, deadline: float = np.inf
     ) -> OnPattern:
-        """Offer the best moves on a pattern; where moves have a least size, also with single ones left out."""
-        solved, before = self.solve(sample, pattern, best.objective, deadline), best.objective
-        best.offer(solved)
+        """Offer the best moves on a pattern; where moves have a least size, also with single ones left out.
+
+        Each takes a share of the programs that are left, and one at least.
+        """
+
+        def solved(pattern: BoolArray) -> OnPattern:
+            return self.solve(
+                sample, pattern, best.objective, deadline, most=max(SHARE * best.left_programs, 1)
+            )
+
+        before, proposed = best.objective, solved(pattern)
+        best.offer(proposed)
         while self.admissible.sized and best.objective < before and best.moves is not None:
             before, moves = best.objective, best.moves
             for i in np.flatnonzero(moves):
-                if perf_counter() > deadline:
-                    return solved
+                if best.left_programs <= 0 or perf_counter() > deadline:
+                    return proposed
                 fewer = moves != 0
                 fewer[i] = False
-                best.offer(self.solve(sample, fewer, best.objective, deadline))
-        return solved
+                best.offer(solved(fewer))
+        return proposed
 
     def _restriction(self, pattern: BoolArray) -> Restriction:
         key = pattern.tobytes()

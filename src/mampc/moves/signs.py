@@ -28,7 +28,7 @@ class Signed(NamedTuple):
     moves: Array | None
     excess: float
     status: QPStatus
-    iterations: int
+    programs: int
 
 
 def search_signs(
@@ -57,7 +57,7 @@ def search_signs(
         deadline: of `perf_counter`; one program is solved whatever the time is.
     """
     first_move = restriction.n_violations
-    best, least, status, iterations, solved = None, cutoff, first.status, first.iterations, 1
+    best, least, status, solved = None, cutoff, first.status, 1
     pending: list[tuple[Array, Array]] = []
     node, (lower, upper) = first, bounds
     while True:
@@ -70,15 +70,14 @@ def search_signs(
                 best = np.where(short > 0, np.copysign(sizes, node.moves), node.moves)
                 least = node.excess
         elif node.moves is None and node.status not in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA):
-            return Signed(None, -np.inf, node.status, iterations)
+            return Signed(None, -np.inf, node.status, solved)
         if not pending:
-            return Signed(best, least, status, iterations)
+            return Signed(best, least, status, solved)
         if solved >= most or perf_counter() > deadline:
-            return Signed(best, least, QPStatus.TIME_LIMIT, iterations)
+            return Signed(best, least, QPStatus.TIME_LIMIT, solved)
         lower, upper = pending.pop()
         node = restriction.solve(optimum, lower, upper)
         solved += 1
-        iterations += node.iterations
 
 
 def _apart(lower: Array, upper: Array, at: int, size: float, value: float) -> list[tuple[Array, Array]]:
