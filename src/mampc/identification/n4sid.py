@@ -320,7 +320,8 @@ def _chosen(
         if feedback:
             return bool(np.isfinite(score.error))
         if trends[k] == "whitened":
-            return min(score.walk, first.walk) > WALK and score.level <= first.level + CLEARLY
+            alike = score.level <= first.level + CLEARLY and score.states <= first.states
+            return min(score.walk, first.walk) > WALK and alike
         simple = score.level <= first.level + CLEARLY and score.states <= first.states
         return k == 0 or simple or score.error < first.error - CLEARLY
 
