@@ -13,6 +13,7 @@ from builders import identified_tank, random_model, tank_problem
 from mampc import Hypothesis, LoadBank, LoadKind
 from mampc.loop.disturbances import state_sizes
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
+from mampc.loop.load_bank import WRONG
 from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.noise import Noise
 from mampc.systems.riccati import predicted_covariance, seen_covariance
@@ -95,17 +96,24 @@ def naive(bank, estimate, drive, surplus):
                 T[a, b] = STAYS
             else:
                 T[a, b] = TO_JUMP if jumps[b] else (1 - STAYS - TO_JUMP) / (B - 2)
-    c, members, likelihood, surprise = mu @ T, [], [], []
+    c, predicted, moved = mu @ T, [], 0.0
     variance, seen = estimate.scale
+    n, C = len(drive), bank.model.C
     for b, member in enumerate(bank.members):
         z = sum(mu[a] * T[a, b] * estimate.members[a] for a in range(B)) / c[b]
-        z = member.A @ z
-        z[: len(drive)] += drive
+        predicted.append(member.A @ z)
+        predicted[-1][:n] += drive
+        moved = moved + c[b] * C @ (predicted[-1][:n] - z[:n])
+    members, likelihood, surprise = [], [], []
+    for z, member in zip(predicted, bank.members, strict=True):
         e = surplus - member.C @ z
         S = member.C @ member.covariance @ member.C.T + member.noise
-        members.append(z + member.covariance @ member.C.T @ np.linalg.solve(S, e))
-        surprise.append(e @ np.linalg.solve(S, e))
-        likelihood.append(np.exp(-0.5 * surprise[-1] / variance) / np.sqrt(np.linalg.det(S)))
+        doubted = 1 + WRONG**2 * moved @ np.linalg.solve(S, moved) / len(e) / min(variance, 1.0)
+        members.append(z + member.covariance @ member.C.T @ np.linalg.solve(S, e) / doubted)
+        surprise.append(e @ np.linalg.solve(S, e) / doubted)
+        likelihood.append(
+            np.exp(-0.5 * surprise[-1] / variance) / np.sqrt(np.linalg.det(S) * doubted ** len(e))
+        )
     mu = c * likelihood / (c @ likelihood)
     usual = np.maximum((1 - FORGETS) * usual + FORGETS * mu, LEAST) * ~np.array(jumps)
     seen = min(seen + 1, NOISE_REMEMBERED)
@@ -127,7 +135,8 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
         members, weights, usual, scale = naive(bank, estimate, drive, surplus)
         predicted = bank.predict(estimate, u, last_v)
         innovation = bank.innovation(predicted, u, y, v)
-        updated, corrected = bank.update(estimate, u, y, last_v, v), bank.corrected(predicted, innovation)
+        updated = bank.update(estimate, u, y, last_v, v)
+        corrected = bank.corrected(predicted, innovation, movement=updated.movement)
         np.testing.assert_allclose(updated.innovation, innovation, rtol=1e-7, atol=1e-9)
         for one in (updated.estimate, corrected):
             np.testing.assert_allclose(one.weights, weights, rtol=1e-6, atol=1e-12)

@@ -102,9 +102,16 @@ class Estimator(ABC):
 
     @abstractmethod
     def corrected(
-        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
+        self,
+        predicted: Estimate,
+        innovation: Array,
+        believed: BoolArray | None = None,
+        movement: Array | None = None,
     ) -> Estimate:
-        """Correct with the innovation (l,), of which only the outputs `believed` count (default all)."""
+        """Correct with the innovation (l,), of which only the outputs `believed` count (default all).
+
+        The model moved the outputs by `movement` (l,) since the last sample, default not at all.
+        """
 
     @abstractmethod
     def loads_of(self, estimate: Estimate) -> Array:
@@ -342,9 +349,16 @@ class KalmanFilter(Estimator):
         return self.corrected(predicted, self.innovation(predicted, u, y, v))
 
     def corrected(
-        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
+        self,
+        predicted: Estimate,
+        innovation: Array,
+        believed: BoolArray | None = None,
+        movement: Array | None = None,
     ) -> Estimate:
-        """Correct with the innovation (l,), of which only the outputs `believed` count (default all)."""
+        """Correct with the innovation (l,), of which only the outputs `believed` count (default all).
+
+        The model moved the outputs by `movement` (l,) since the last sample, default not at all.
+        """
         gain = self.gain
         if believed is not None:
             gain, innovation = self.gain_with(believed), np.where(believed, innovation, 0.0)

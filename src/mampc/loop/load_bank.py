@@ -9,6 +9,11 @@ mixture of all that may have led to them:
 with the innovation e_b of filter b and its covariance S_b. These hold up to one factor, which the innovations of late
 tell: loads are told in units of the noise, so noise that was told wrongly changes no gain.
 
+While the model moves the outputs, by v in a sample, it may be wrong by a share rho of that: the innovation varies by
+1 + rho^2 v' S_b^-1 v / l times as much then, and what is corrected falls by as much. So what a plant does later or
+less than its model, after a move, is not taken for a load. The factor of the noise counts up to one here: errors of the
+model, which make it larger, are no reason for less caution.
+
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
 """
@@ -32,6 +37,7 @@ from mampc.systems.state_space import StateSpace
 NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
+WRONG = 0.5  # rho: the share of its movement of outputs within a sample by which the model may be wrong
 SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
@@ -125,7 +131,7 @@ class LoadBank(Estimator):
         self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
         self._planning_model = self.loads.with_fading(self._kept) if self._kept else model
         self._mixing = Mixing(np.array([h.load is LoadKind.JUMPS for h in self.hypotheses]))
-        self._per_output = np.ones(model.n_outputs)
+        self._per_output, self._rest = np.ones(model.n_outputs), np.zeros(model.n_outputs)
         self._A = np.stack([member.A for member in self.members])
         self._C = np.stack([member.C for member in self.members])
         self._plans = np.stack([self.to_plan(b) for b in range(len(self.members))])
@@ -251,8 +257,8 @@ class LoadBank(Estimator):
         if not is_usable(each):
             return None
         each = each.reshape(len(c), -1)
-        seen = c.dot(each[:, n_z:-l])  # innovation and movement of the mixture
-        estimate = self._weighed(each[:, :n_z], c, bank, each[:, -l:], self._everything)
+        seen = c.dot(each[:, 2 * n_z : -l])  # innovation and movement of the mixture
+        estimate = self._weighed(*self._split(each), seen[l:], c, bank, self._everything)
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
@@ -264,14 +270,19 @@ class LoadBank(Estimator):
             n_z, l, hypotheses = mixed.shape[2], y.shape[1], len(self.members)
             each = np.matmul(self._of_states, mixed[..., None])[..., 0]
             each += (known @ self._of_known.T).reshape(len(y), hypotheses, -1)
-            seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:-l])
-            estimate = self._weighed(each[:, :, :n_z], c, bank, each[:, :, -l:], self._everything)
+            seen = np.einsum("sb,sbi->si", c, each[:, :, 2 * n_z : -l])
+            estimate = self._weighed(*self._split(each), seen[:, l:], c, bank, self._everything)
         return Updated(estimate, seen[:, :l], seen[:, l:])
+
+    def _split(self, each: Array) -> tuple[Array, Array, Array]:
+        """Of all that `_everyday` gives: z predicted, its correction, and the innovation made white."""
+        n_z, l = self._A.shape[1], self.model.n_outputs
+        return each[..., :n_z], each[..., n_z : 2 * n_z], each[..., -l:]
 
     def _everyday(self) -> tuple[Array, Array]:
         """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1) to all that `update` needs.
 
-        For each hypothesis: z corrected, innovation, movement of the outputs, innovation made white.
+        For each hypothesis: z predicted, its correction, innovation, movement of the outputs, innovation made white.
         """
         model = self.model
         n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
@@ -285,8 +296,9 @@ class LoadBank(Estimator):
             driven = np.vstack([drive, np.zeros((len(A) - n, drive.shape[1]))])
             moved = model.C @ (A[:n] - np.eye(n, len(A)))
             innovation = surplus - C @ driven
-            of_states.append(np.vstack([A - K @ C @ A, -C @ A, moved, -W @ C @ A]))
-            of_known.append(np.vstack([driven + K @ innovation, innovation, model.C @ drive, W @ innovation]))
+            seen = -C @ A
+            of_states.append(np.vstack([A, K @ seen, seen, moved, W @ seen]))
+            of_known.append(np.vstack([driven, K @ innovation, innovation, model.C @ drive, W @ innovation]))
         return np.stack(of_states), np.vstack(of_known)
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
@@ -305,15 +317,23 @@ class LoadBank(Estimator):
         return innovation
 
     def corrected(
-        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
+        self,
+        predicted: Estimate,
+        innovation: Array,
+        believed: BoolArray | None = None,
+        movement: Array | None = None,
     ) -> BankEstimate:
-        """Correct with the innovation (l,) of the mixture, of which only the outputs `believed` count."""
+        """Correct with the innovation (l,) of the mixture, of which only the outputs `believed` count.
+
+        The model moved the outputs by `movement` (l,) since the last sample, default not at all.
+        """
         bank, believed = _bank(predicted), self._all if believed is None else believed
         seen, filters = self._seen(bank.members), self.filters(believed)
         each = np.where(believed, innovation, 0.0) + bank.weights @ seen - seen
-        members = bank.members + np.matmul(filters.gains, each[:, :, None])[:, :, 0]
+        correction = np.matmul(filters.gains, each[:, :, None])[:, :, 0]
         white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
-        return self._weighed(members, bank.weights, bank, white, filters)
+        moved = self._rest if movement is None else movement
+        return self._weighed(bank.members, correction, white, moved, bank.weights, bank, filters)
 
     def filters(self, believed: BoolArray) -> Filters:
         """The gains where only some outputs, bool (l,), are believed."""
@@ -331,13 +351,25 @@ class LoadBank(Estimator):
         return filters
 
     def _weighed(
-        self, members: Array, c: Array, bank: BankEstimate, white: Array, filters: Filters
+        self,
+        members: Array,
+        correction: Array,
+        white: Array,
+        movement: Array,
+        c: Array,
+        bank: BankEstimate,
+        filters: Filters,
     ) -> BankEstimate:
-        """The estimate after Bayes' rule, from the innovations made white, shape (..., B, l)."""
-        surprise = np.square(white).dot(self._per_output)
+        """The estimate after Bayes' rule, from innovations made white, shape (..., B, l), and movements (..., l)."""
+        moved = (filters.whiten @ movement[..., None, :, None])[..., 0]
+        doubt = WRONG**2 / max(filters.believed, 1) / np.minimum(bank.scale[..., :1], 1.0)
+        trust = 1 / (1 + doubt * np.square(moved).dot(self._per_output))
+        surprise = trust * np.square(white).dot(self._per_output)
+        log_scale = filters.log_scale + 0.5 * filters.believed * np.log(trust)
         after = self._mixing.one if surprise.ndim == 1 else self._mixing.many
         return self._estimate(
-            members, *after(c, surprise, filters.log_scale, filters.believed, bank.usual, bank.scale)
+            members + trust[..., None] * correction,
+            *after(c, surprise, log_scale, filters.believed, bank.usual, bank.scale),
         )
 
     def _estimate(self, members: Array, weights: Array, usual: Array, scale: Array) -> BankEstimate:

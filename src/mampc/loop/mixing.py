@@ -56,7 +56,7 @@ class Mixing:
         Args:
             c: of `before`.
             surprise: e' S^-1 e of each hypothesis, shape (S, B).
-            log_scale: -1/2 log det S, shape (B,).
+            log_scale: -1/2 log det S, shape (S, B).
             believed: how many outputs are.
             usual, scale: at the last sample, shapes (S, B) and (S, 2).
         """
