@@ -273,4 +273,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    import attention  # other processes find its functions by this name
+
+    attention.main()
