@@ -361,9 +361,14 @@ class LoadBank(Estimator):
         filters: Filters,
     ) -> BankEstimate:
         """The estimate after Bayes' rule, from innovations made white, shape (..., B, l), and movements (..., l)."""
-        moved = (filters.whiten @ movement[..., None, :, None])[..., 0]
-        doubt = WRONG**2 / max(filters.believed, 1) / np.minimum(bank.scale[..., :1], 1.0)
-        trust = 1 / (1 + doubt * np.square(moved).dot(self._per_output))
+        share = WRONG**2 / max(filters.believed, 1)
+        if movement.ndim == 1:
+            moved = filters.whiten.dot(movement)
+            moved *= share / min(float(bank.scale[0]), 1.0) * moved
+        else:
+            moved = np.square(filters.whiten @ movement[:, None, :, None])[..., 0]
+            moved *= share / np.minimum(bank.scale[:, :1, None], 1.0)
+        trust = 1 / (1 + moved.dot(self._per_output))
         surprise = trust * np.square(white).dot(self._per_output)
         log_scale = filters.log_scale + 0.5 * filters.believed * np.log(trust)
         after = self._mixing.one if surprise.ndim == 1 else self._mixing.many
