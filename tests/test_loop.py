@@ -10,7 +10,8 @@ import pytest
 import mampc
 from builders import identified_tank, random_model, same_decision, tank_model, tank_problem, tank_reference
 from mampc import Status
-from mampc.loop.estimation import Estimate, static_response
+from mampc.loop.estimator import Estimate
+from mampc.loop.kalman_filter import static_response
 
 TANK = mampc.plants.QuadrupleTank()
 

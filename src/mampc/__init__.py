@@ -25,8 +25,8 @@ from mampc.identification import (
 )
 from mampc.loop import loads
 from mampc.loop.batch import Batch, simulate_batch
-from mampc.loop.estimation import KalmanFilter
 from mampc.loop.hypotheses import Hypothesis
+from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.learnt_gains import LearntGains, learn_gains
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.metrics import Metrics

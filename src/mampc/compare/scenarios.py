@@ -16,7 +16,7 @@ from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError
 from mampc.loop.batch import simulate_batch
 from mampc.loop.disturbances import response_within_reach
-from mampc.loop.estimation import static_response
+from mampc.loop.kalman_filter import static_response
 from mampc.loop.loads import Coloured, Load, RandomSteps, RandomWalk, drawn
 from mampc.loop.regulator import Regulator
 from mampc.program.problem import Limits, TrackingProblem

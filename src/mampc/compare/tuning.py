@@ -21,7 +21,8 @@ from mampc.compare.fronts import Estimate, Point, non_dominated
 from mampc.compare.promise import Expected, Goal, error_ratio, moves_per_hour
 from mampc.compare.scenarios import Scenarios, Surroundings, usual_problem
 from mampc.controllers import MAMPC, MPC, ControllerBank
-from mampc.loop.estimation import Estimator, KalmanFilter
+from mampc.loop.estimator import Estimator
+from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.regulator import Regulator
 from mampc.moves.rules import MoveRules

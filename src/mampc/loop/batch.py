@@ -14,7 +14,7 @@ from mampc.base.names import Names
 from mampc.base.progress import watched
 from mampc.controllers.decision import ControllerState, Decision
 from mampc.loop.batched_plans import EachPlans, batched_plans
-from mampc.loop.estimation import KalmanFilter
+from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.loads import Load
 from mampc.loop.metrics import Metrics

@@ -12,7 +12,8 @@ from typing import Any
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.mampc import MAMPC
-from mampc.loop.estimation import Estimator, KalmanFilter
+from mampc.loop.estimator import Estimator
+from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.methods.alternating import Alternating
 

@@ -20,17 +20,16 @@ stationary gains, and with jumps that give way to what held before them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
-from mampc.loop.estimation import Estimate, Estimator, Updated
+from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
-from mampc.loop.mixing import Mixing
+from mampc.loop.mixing import BankEstimate, Filters, Mixing
 from mampc.program.problem import TrackingProblem
 from mampc.systems.state_space import StateSpace
 
@@ -41,41 +40,6 @@ WRONG = 0.5  # rho: the share of its movement of outputs within a sample by whic
 SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
-
-
-@dataclass(frozen=True, eq=False)
-class BankEstimate(Estimate):
-    """What every hypothesis estimates, and their mixture.
-
-    Attributes:
-        x: states of `planning_model`: those of the plant, and loads that fade.
-        output_disturbance, input_disturbance: lasting ones, shapes (l,) and (m,).
-        members: z of each hypothesis, shape (B, n + 2k).
-        weights: how likely each hypothesis is, shape (B,), with sum 1.
-        usual: how likely each one is on average of the samples without jumps, shape (B,), with sum 1.
-        scale: variance of the innovations beside what the noise told leads to, and how many samples have shown it.
-    """
-
-    members: Array
-    weights: Array
-    usual: Array
-    scale: Array
-
-
-class Filters(NamedTuple):
-    """The gains of all hypotheses where some outputs are believed, and what measures their innovations.
-
-    Attributes:
-        gains: shape (B, n + 2k, l).
-        whiten: W with |W e|^2 = e' S^-1 e, shape (B, l, l).
-        log_scale: -1/2 log det S, shape (B,).
-        believed: how many outputs are.
-    """
-
-    gains: Array
-    whiten: Array
-    log_scale: Array
-    believed: int
 
 
 class LoadBank(Estimator):

@@ -7,9 +7,13 @@ and how many samples have shown it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
+from mampc.loop.estimator import Estimate
 
 STAYS = 0.998  # chance that a load goes on as it does
 TO_JUMP = 0.001  # chance that it jumps; what is left goes to the other hypotheses
@@ -20,6 +24,41 @@ NOISE_REMEMBERED = 100.0  # and of what is seen of it
 NOISE_RANGE = (0.01, 100.0)  # of the variance, beside what was told
 UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
 IMPOSSIBLE = 1e-300  # no hypothesis is less likely, so that some are left whatever comes
+
+
+@dataclass(frozen=True, eq=False)
+class BankEstimate(Estimate):
+    """What every hypothesis estimates, and their mixture.
+
+    Attributes:
+        x: states of `planning_model`: those of the plant, and loads that fade.
+        output_disturbance, input_disturbance: lasting ones, shapes (l,) and (m,).
+        members: z of each hypothesis, shape (B, n + 2k).
+        weights: how likely each hypothesis is, shape (B,), with sum 1.
+        usual: how likely each one is on average of the samples without jumps, shape (B,), with sum 1.
+        scale: variance of the innovations beside what the noise told leads to, and how many samples have shown it.
+    """
+
+    members: Array
+    weights: Array
+    usual: Array
+    scale: Array
+
+
+class Filters(NamedTuple):
+    """The gains of all hypotheses where some outputs are believed, and what measures their innovations.
+
+    Attributes:
+        gains: shape (B, n + 2k, l).
+        whiten: W with |W e|^2 = e' S^-1 e, shape (B, l, l).
+        log_scale: -1/2 log det S, shape (B,).
+        believed: how many outputs are.
+    """
+
+    gains: Array
+    whiten: Array
+    log_scale: Array
+    believed: int
 
 
 class Mixing:

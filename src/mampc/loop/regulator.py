@@ -23,7 +23,7 @@ from mampc.controllers.decision import Decision
 from mampc.controllers.mampc import MAMPC
 from mampc.loop.actuators import LATEST, Actuators
 from mampc.loop.defaults import default_estimator
-from mampc.loop.estimation import Estimate, Estimator
+from mampc.loop.estimator import Estimate, Estimator
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.sensors import Judged, SensorChecks, SensorState
 from mampc.loop.state import RegulatorState

@@ -27,7 +27,7 @@ import numpy as np
 from mampc.base.checks import LARGEST, Array, BoolArray, as_array, as_limit, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.base.words import Fault
-from mampc.loop.estimation import static_response
+from mampc.loop.kalman_filter import static_response
 from mampc.program.problem import TrackingProblem
 
 

@@ -12,8 +12,8 @@ from mampc.base.checks import Array, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.controllers.decision import ControllerState
 from mampc.loop.actuators import ActuatorState
-from mampc.loop.estimation import Estimate
-from mampc.loop.load_bank import BankEstimate
+from mampc.loop.estimator import Estimate
+from mampc.loop.mixing import BankEstimate
 from mampc.loop.sensors import SensorState
 
 FORMAT = "mampc-regulator-state-1"

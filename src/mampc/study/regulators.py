@@ -12,7 +12,8 @@ from mampc.base.errors import MampcError, StudyError
 from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.loop.defaults import default_estimator
-from mampc.loop.estimation import Estimator, KalmanFilter
+from mampc.loop.estimator import Estimator
+from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.regulator import Regulator
 from mampc.loop.sensors import SensorChecks
