@@ -55,7 +55,7 @@ format: .venv/dev.stamp  ## put the code in shape
 bench: .venv/dev.stamp  ## speed, as ratios measured side by side
 	$(BIN)/python benchmarks/bench.py
 
-conditioning: .venv/dev.stamp  ## 2000 badly conditioned problems against brute force in 60 digits
+conditioning: .venv/dev.stamp  ## 2000 badly conditioned problems against brute force in 120 digits
 	$(BIN)/python benchmarks/conditioning.py
 
 methods: .venv/dev.stamp  ## compare all methods on random instances, and renew their table in docs/methods.md

@@ -3,7 +3,7 @@
     python benchmarks/conditioning.py [first] [last]
 
 Decisions on problems with integrators, unstable and slow poles, weights and outputs of any size, limits and rules of
-every kind against brute force in 60 digits (tests/conditioned.py), one kind of plant a line.
+every kind against brute force in 120 digits (tests/conditioned.py), one kind of plant a line.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def main() -> None:
         "objective off by",
         "bound above by",
     )
-    table = Table(*columns, title="exact method against brute force in 60 digits, worst of all, relative")
+    table = Table(*columns, title="exact method against brute force in 120 digits, worst of all, relative")
     for kind, found in results.items():
         proven = [result for result in found if result.outcome == "optimal"]
         others = sorted({result.outcome for result in found} - {"optimal"})

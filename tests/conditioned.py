@@ -1,15 +1,23 @@
-"""Problems at any conditioning, and their optimum in 60 digits: brute force over patterns, signs and active limits."""
+"""Problems at any conditioning, and their optimum in 120 digits: brute force over patterns, signs and active limits.
 
-from itertools import product
-from typing import NamedTuple
+The digits are Arb's, which encloses every result in a ball that holds the truth. mpmath's 60 digits, at a thirtieth of
+the speed, check them.
+"""
 
+from collections.abc import Callable
+from itertools import pairwise, product
+from math import inf
+from typing import Any, NamedTuple
+
+import flint
 import mpmath
 import numpy as np
 
 import mampc
 from referees import all_patterns, charge, keeps_rules
 
-mpmath.mp.dps = 60
+mpmath.mp.dps, flint.ctx.dps = 60, 120
+TINY = 1e-30
 KINDS = ("double integrator", "triple integrator", "unstable", "slow", "ordinary")
 RULES = ("max_moves", "price", "dwell", "max_moves_per_step", "blocks", "min_size")
 
@@ -90,126 +98,141 @@ def case_of(seed):
     return Case(kind, problem, rules, np.tile(u, (rules.memory, 1)), x, reference)
 
 
-def matrix(array):
-    return mpmath.matrix(np.atleast_2d(array).tolist())
+class Arithmetic(NamedTuple):
+    """Numbers of many digits: from floats, matrices of zeros, solutions of linear equations, and back to floats."""
+
+    number: Callable[[Any], Any]
+    zeros: Callable[[int, int], Any]
+    solve: Callable[[Any, Any], Any]
+    rounded: Callable[[Any], float]
+
+    def matrix(self, rows):
+        """The matrix of these rows."""
+        found = self.zeros(len(rows), len(rows[0]))
+        for i, row in enumerate(rows):
+            for j, entry in enumerate(row):
+                found[i, j] = self.number(entry)
+        return found
+
+
+def rounded(ball):
+    """The double next to a ball, which has to tell it."""
+    if ball != inf and ball.rel_accuracy_bits() < 60:
+        raise ArithmeticError(f"expected digits that determine a double, received {ball}")
+    return float(ball)
+
+
+ARB = Arithmetic(flint.arb, flint.arb_mat, flint.arb_mat.solve, rounded)
+MPMATH = Arithmetic(mpmath.mpf, mpmath.zeros, mpmath.lu_solve, float)
 
 
 class Referee:
-    """The cost of one case as a quadratic form in 60 digits, with the tail summed up until it vanishes."""
+    """The cost of one case as a quadratic form in many digits, with the tail summed up until it vanishes."""
 
-    def __init__(self, case):
+    def __init__(self, case, arithmetic=ARB):
         problem, model = case.problem, case.problem.model
         n_p, n_c, m = problem.prediction_horizon, problem.control_horizon, model.n_inputs
-        n = n_c * m
-        A, B, C, D = (matrix(a) for a in (model.A, model.B, model.C, model.D))
-        q, y_op = mpmath.mpf(float(problem.output_weight[0, 0])), mpmath.mpf(float(model.y_op[0]))
-        r = mpmath.mpf(float(case.reference[0])) - y_op
-        u = [
-            mpmath.mpf(float(a)) - mpmath.mpf(float(b))
-            for a, b in zip(case.past[-1], model.u_op, strict=True)
-        ]
-        L = mpmath.mpf(problem.tail_horizon)
-        gamma = L / (1 + L)
-        # Per column: a state under each unit move, and last that without moves.
-        X = mpmath.zeros(model.n_states, n + 1)
+        self.case, self.arithmetic = case, arithmetic
+        number, n = arithmetic.number, n_c * m
+        A, B, C, D = (arithmetic.matrix(a) for a in (model.A, model.B, model.C, model.D))
+        # Per column: a state, inputs and errors under each unit move, and last those without moves.
+        X, U, r = (arithmetic.zeros(rows, n + 1) for rows in (model.n_states, m, 1))
         for i in range(model.n_states):
-            X[i, n] = mpmath.mpf(float(case.x[i]))
-        U = mpmath.zeros(m, n + 1)
+            X[i, n] = number(case.x[i])
         for a in range(m):
-            U[a, n] = u[a]
-        self.H, weight, i = mpmath.zeros(n + 1, n + 1), mpmath.mpf(1), 0
+            U[a, n] = number(case.past[-1, a]) - number(model.u_op[a])
+        r[0, n] = number(case.reference[0]) - number(model.y_op[0])
+        q, L = number(problem.output_weight[0, 0]), number(problem.tail_horizon)
+        gamma = L / (1 + L)
+        self.n, self.H, i = n, arithmetic.zeros(n + 1, n + 1), 0
         while True:
-            if i < n_c:
-                for a in range(m):
-                    U[a, i * m + a] = mpmath.mpf(1)
-            row = -(C * X + D * U)
-            row[0, n] += r
-            self.H += (q * weight) * (row.T * row)
-            if i >= n_p:
-                weight = gamma ** (i + 1 - n_p)
-                size = max(abs(entry) for entry in row)
-                if weight * size**2 < mpmath.mpf(10) ** -30:
-                    break
+            for a in range(m if i < n_c else 0):
+                U[a, i * m + a] = number(1.0)
+            error = r - C * X - D * U
+            weight = gamma ** max(0, i - n_p)
+            self.H += error.transpose() * error * (q * weight)
+            if i > n_p and weight * max(abs(error[0, j]) for j in range(n + 1)) ** 2 < TINY:
+                break
             X, i = A * X + B * U, i + 1
         R = problem.move_weight
         for j in range(n_c if problem.weigh_first_move else 0):
             for a, b in product(range(m), repeat=2):
-                self.H[j * m + a, j * m + b] += mpmath.mpf(float(R[a, b]))
-        self.case, self.n = case, n
+                self.H[j * m + a, j * m + b] += number(R[a, b])
 
     def cost(self, plan):
         """The cost of planned inputs, price aside."""
-        at = [mpmath.mpf(float(v)) for v in self.case.past[-1]]
-        d = []
-        for row in plan:
-            now = [mpmath.mpf(float(v)) for v in row]
-            d += [b - a for a, b in zip(at, now, strict=True)]
-            at = now
-        z = matrix([*d, mpmath.mpf(1)]).T
-        return (z.T * self.H * z)[0]
+        number, inputs = self.arithmetic.number, [self.case.past[-1], *plan]
+        d = [
+            number(b) - number(a)
+            for last, now in pairwise(inputs)
+            for a, b in zip(last.tolist(), now.tolist(), strict=True)
+        ]
+        z = self.arithmetic.matrix([[*d, 1.0]])
+        return self.arithmetic.rounded((z * self.H * z.transpose())[0, 0])
 
     def optimum(self):
-        """The least objective of all admissible plans."""
+        """The least objective of all admissible plans, infinite if there is none."""
         problem, rules, past = self.case.problem, self.case.rules, self.case.past
         found = [
-            (self._rough(pattern.ravel()), charge(rules, pattern), pattern.ravel())
+            (self._free(pattern.ravel()), charge(rules, pattern), pattern.ravel())
             for pattern in all_patterns(problem.control_horizon, problem.model.n_inputs)
             if keeps_rules(rules, past, pattern)
         ]
         # A pattern costs at least its optimum without limits, which is worked out in full one after another.
-        found.sort(key=lambda entry: entry[0] + entry[1])
-        best = mpmath.inf
-        for rough, price, pattern in found:
-            if rough + price >= best:
-                continue
-            best = min(best, self._on(pattern) + mpmath.mpf(float(price)))
-        return best
+        found.sort(key=lambda entry: float(entry[0] + entry[1]))
+        best = inf
+        for free, price, pattern in found:
+            if not free + price >= best:
+                best = min(best, self._on(pattern) + self.arithmetic.number(price))
+        return self.arithmetic.rounded(best)
 
-    def _rough(self, pattern):
+    def _free(self, pattern):
         return self._solve(np.flatnonzero(pattern).tolist(), [])[0]
 
-    def _solve(self, moves, rows):
-        """Least cost, moves and multipliers where rows a'd = b hold, each a dict of the moves and b."""
+    def _stationary(self, moves, rows, linear, values):
+        """Moves d and multipliers p with H d + A'p = linear and A d = values, each row of A a dict."""
         k, e = len(moves), len(rows)
-        constant = self.H[self.n, self.n]
-        if not k:
-            return constant, [], []
-        K, h = mpmath.zeros(k + e, k + e), mpmath.zeros(k + e, 1)
+        K, h = self.arithmetic.zeros(k + e, k + e), self.arithmetic.zeros(k + e, 1)
         for i, a in enumerate(moves):
-            h[i] = -self.H[a, self.n]
+            h[i, 0] = linear[i]
             for j, b in enumerate(moves):
                 K[i, j] = self.H[a, b]
-        for i, (row, value) in enumerate(rows):
-            for j, a in enumerate(moves):
-                K[k + i, j] = K[j, k + i] = mpmath.mpf(row.get(a, 0))
-            h[k + i] = value
-        z = mpmath.lu_solve(K, h)
-        d = [z[i] for i in range(k)]
-        quadratic = sum(d[i] * self.H[a, b] * d[j] for i, a in enumerate(moves) for j, b in enumerate(moves))
-        linear = sum(d[i] * self.H[a, self.n] for i, a in enumerate(moves))
-        return constant + 2 * linear + quadratic, d, [z[k + i] for i in range(e)]
+            for j, row in enumerate(rows):
+                K[k + j, i] = K[i, k + j] = self.arithmetic.number(row.get(a, 0.0))
+        for j, value in enumerate(values):
+            h[k + j, 0] = value
+        z = self.arithmetic.solve(K, h)
+        z = [z[i, 0] for i in range(k + e)]
+        return z[:k], z[k:]
+
+    def _solve(self, moves, bounds):
+        """Least cost, moves and multipliers where bounds, pairs of a row and its value, hold as equations."""
+        constant = self.H[self.n, self.n]
+        if not moves:
+            return constant, [], []
+        linear, values = [self.H[a, self.n] for a in moves], [value for _, value in bounds]
+        d, pulls = self._stationary(moves, [row for row, _ in bounds], [-f for f in linear], values)
+        cost = constant + sum(f * v for f, v in zip(linear, d, strict=True))
+        return cost - sum(p * b for p, b in zip(pulls, values, strict=True)), d, pulls
 
     def _on(self, pattern):
         """The least cost on one pattern, by trying all signs of moves with a least size."""
-        problem, rules = self.case.problem, self.case.rules
+        problem, rules, number = self.case.problem, self.case.rules, self.arithmetic.number
         m, limits = problem.model.n_inputs, problem.limits
         moves = np.flatnonzero(pattern).tolist()
         size = np.broadcast_to(np.asarray(rules.min_size, float), m)
         bounds = []
         for i in moves:
             a = i % m
-            u = mpmath.mpf(float(self.case.past[-1][a]))
-            row = {k: 1 for k in moves if k <= i and k % m == a}
-            for sign, limit in ((1, limits.u_max[a]), (-1, limits.u_min[a])):
+            u = number(self.case.past[-1, a])
+            for sign, limit in ((1.0, limits.u_max[a]), (-1.0, limits.u_min[a])):
                 if np.isfinite(limit):
-                    value = sign * (mpmath.mpf(float(limit)) - u)
-                    bounds.append((dict.fromkeys(row, sign), value))
-        best = mpmath.inf
+                    row = dict.fromkeys((k for k in moves if k <= i and k % m == a), sign)
+                    bounds.append((row, sign * (number(limit) - u)))
+        best = inf
         sized = [i for i in moves if size[i % m] > 0]
-        for signs in product((1, -1), repeat=len(sized)):
-            least = [
-                ({i: -sign}, -mpmath.mpf(float(size[i % m]))) for i, sign in zip(sized, signs, strict=True)
-            ]
+        for signs in product((1.0, -1.0), repeat=len(sized)):
+            least = [({i: -sign}, -number(size[i % m])) for i, sign in zip(sized, signs, strict=True)]
             best = min(best, self._within(moves, bounds + least, best))
         return best
 
@@ -218,47 +241,34 @@ class Referee:
 
         The dual active-set method of Goldfarb and Idnani: each point is the optimum of a relaxation.
         """
-        near = mpmath.mpf(10) ** -30
         active = []
         while True:
-            cost, d, _ = self._solve(moves, [bounds[i] for i in active])
+            cost, d, pulls = self._solve(moves, [bounds[i] for i in active])
             if cost >= cutoff:
                 return cost
             at = dict(zip(moves, d, strict=True))
             excess = [sum(v * at[k] for k, v in row.items()) - b for row, b in bounds]
-            worst = max(range(len(bounds)), key=lambda i: excess[i], default=None)
-            if worst is None or excess[worst] <= near:
+            worst = max(set(range(len(bounds))) - set(active), key=lambda i: excess[i], default=None)
+            if worst is None or excess[worst] <= TINY:
                 return cost
-            row, left, pulls = bounds[worst][0], excess[worst], None
+            row, left = bounds[worst][0], excess[worst]
             while True:
-                if pulls is None:
-                    pulls = self._solve(moves, [bounds[i] for i in active])[2]
-                step, change = self._direction(moves, [bounds[i][0] for i in active], row)
-                gain = -sum(v * step[k] for k, v in row.items())
-                full = left / gain if gain > near else mpmath.inf
-                ratios = [
-                    -pull / by if by < -near else mpmath.inf for pull, by in zip(pulls, change, strict=True)
-                ]
-                at = min(range(len(ratios)), key=lambda i: ratios[i], default=None)
-                length = full if at is None else min(full, ratios[at])
-                if length == mpmath.inf:
-                    return mpmath.inf
-                pulls = [pull + length * by for pull, by in zip(pulls, change, strict=True)]
+                step, change = self._stationary(
+                    moves,
+                    [bounds[i][0] for i in active],
+                    [-row.get(a, 0.0) for a in moves],
+                    [0.0] * len(active),
+                )
+                gain = -sum(v * step[moves.index(k)] for k, v in row.items())
+                full = left / gain if gain > TINY else inf
+                ratios = [-p / by if by < -TINY else inf for p, by in zip(pulls, change, strict=True)]
+                first = min(range(len(ratios)), key=lambda i: ratios[i], default=None)
+                length = full if first is None else min(full, ratios[first])
+                if length == inf:
+                    return inf
+                pulls = [p + length * by for p, by in zip(pulls, change, strict=True)]
                 left -= length * gain
-                if length == full:
+                if length is full:
                     active.append(worst)
                     break
-                del active[at], pulls[at]
-
-    def _direction(self, moves, rows, row):
-        """How moves and multipliers of the active rows change per unit of pull of one more row."""
-        k, e = len(moves), len(rows)
-        K, h = mpmath.zeros(k + e, k + e), mpmath.zeros(k + e, 1)
-        for i, a in enumerate(moves):
-            h[i] = -mpmath.mpf(row.get(a, 0))
-            for j, b in enumerate(moves):
-                K[i, j] = self.H[a, b]
-            for j, other in enumerate(rows):
-                K[k + j, i] = K[i, k + j] = mpmath.mpf(other.get(a, 0))
-        z = mpmath.lu_solve(K, h)
-        return dict(zip(moves, z[:k], strict=True)), list(z[k:])
+                del active[first], pulls[first]
