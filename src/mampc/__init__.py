@@ -30,6 +30,7 @@ from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.learnt_gains import LearntGains, learn_gains
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.metrics import Metrics
+from mampc.loop.recorder import Recorder
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.regulator import Regulator
 from mampc.loop.replay import Difference, Recording, replay
@@ -96,6 +97,7 @@ __all__ = [
     "OnOff",
     "PenaltyDecomposition",
     "PlannedTest",
+    "Recorder",
     "Recording",
     "ReferenceFilter",
     "Regulator",

@@ -56,7 +56,10 @@ def run(
 @app.command()
 def replay(
     run: Annotated[
-        Path, typer.Argument(help="A trajectory that `mampc run` wrote, SCENARIO_CONTROLLER.csv.")
+        Path,
+        typer.Argument(
+            help="A trajectory that `mampc run` wrote, SCENARIO_CONTROLLER.csv, or a live loop's `Recorder`."
+        ),
     ],
     study: Annotated[
         str, typer.Option("--study", "-s", help="The study it came from: a name or a TOML file.")
@@ -64,6 +67,9 @@ def replay(
     tolerance: Annotated[
         float, typer.Option(help="Of inputs and objectives, relative to their size; 0 for the same bits.")
     ] = 1e-9,
+    controller: Annotated[
+        str | None, typer.Option("--controller", "-c", help="Of the study, which a live loop ran with.")
+    ] = None,
     trust: Trust = False,
 ) -> None:
     """Decide again on the recorded measurements of a run, and find the first decision that differs.
@@ -71,16 +77,18 @@ def replay(
     The model is the model.json beside the run, if there is one, else it is identified again. Exits with 0 if
     every decision comes out as recorded, with 1 if one differs.
 
-    Example:
+    Examples:
 
         mampc replay results/quadruple-tank/noisy_exact-price.csv --study quadruple-tank
+
+        mampc replay monday.csv --study my-study.toml --controller "exact price"
     """
     from mampc.report.replaying import replay_trajectory
     from mampc.study import load_study
 
     plan = load_study(study, trust=True if trust else None)
     with progress() as show:
-        samples, difference = replay_trajectory(run, plan, tolerance, show)
+        samples, difference = replay_trajectory(run, plan, tolerance, show, controller)
     if difference is not None:
         console_for_tables().print(
             f"{run}: the first difference is at {difference}", soft_wrap=True, markup=False

@@ -16,8 +16,9 @@ from mampc.base.checks import Array, as_number
 from mampc.base.csv_table import CSVTable
 from mampc.base.errors import MampcError
 from mampc.base.names import Names
+from mampc.loop.recorder import Live, read_live
 from mampc.loop.regulator import Regulator
-from mampc.loop.run import ENDS, Run, told
+from mampc.loop.run import ENDS, Run, told_by
 from mampc.loop.state import RegulatorState
 from mampc.program.zone import Zone
 
@@ -26,22 +27,22 @@ SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a regulator was told in T samples of a simulated run, and what it decided, in engineering units.
+    """What a regulator was told in T samples, and what it decided, in engineering units.
 
-    (Neither applied inputs that differ from the decided ones, nor limits of single samples, nor inputs in manual; nor,
-    with preview, a reference that goes on beyond the run.)
+    (Of a simulated run with preview not how the reference goes on beyond the run.)
 
     Attributes:
         t: seconds, shape (T,).
         y: measurements, shape (T, l), not-a-number where none came.
         r: references, shape (T, l).
-        v: measured disturbances, shape (T, d).
+        v: measured disturbances, shape (T, d), not-a-number where none came.
         u: decided inputs, shape (T, m).
         objective: of each decision, shape (T,), not-a-number where inputs were held.
         status, remarks, ignored, load: of each decision, as text.
         variant: which controller of a `ControllerBank` decided, by name; empty words where there is none.
         names: of the signals.
         zone: told in place of the references, ends of shape (T, l); None where none was.
+        live: of a `Recorder`, what each sample of a live loop was told beside that; none of a simulated run.
     """
 
     t: Array
@@ -57,13 +58,14 @@ class Recording:
     variant: tuple[str, ...]
     names: Names
     zone: Zone | None = None
+    live: tuple[Live, ...] = ()
 
     @classmethod
     def of(cls, run: Run) -> Recording:
         """The recording of a simulated run."""
         objective = np.array([decision.objective for decision in run.decisions])
         status = tuple(decision.status.value for decision in run.decisions)
-        said = [told(decision) for decision in run.decisions]
+        said = [told_by(decision) for decision in run.decisions]
         remarks, ignored, load, variant = (
             tuple(words[kind] for words in said) for kind in ("remarks", "ignored", "load", "variant")
         )
@@ -85,8 +87,13 @@ class Recording:
 
     @classmethod
     def from_csv(cls, path: str | Path, names: Names) -> Recording:
-        """Read what `Run.to_csv` wrote of a plant with these names; raises `MampcError` for anything else."""
+        """Read what `Run.to_csv` or a `Recorder` wrote of a plant with these names.
+
+        Raises:
+            MampcError: anything else.
+        """
         table = CSVTable(path)
+        live = read_live(table, names)
 
         def columns(words: list[str], *, finite: bool = True) -> Array:
             read = [table.numbers(word, finite=finite) for word in words]
@@ -98,8 +105,8 @@ class Recording:
         return cls(
             table.numbers("time"),
             columns([f"{name}_measured" for name in names.outputs], finite=False),
-            columns([f"{name}_reference" for name in names.outputs], finite=zone is None),
-            columns(list(names.disturbances)),
+            columns([f"{name}_reference" for name in names.outputs], finite=zone is None and not live),
+            columns(list(names.disturbances), finite=not live),
             columns(list(names.inputs)),
             table.numbers("objective", finite=False),
             tuple(table.words("status")),
@@ -109,7 +116,18 @@ class Recording:
             tuple(table.words("variant")),
             names,
             zone,
+            live,
         )
+
+    def asked(self, k: int, samples: int | None) -> Array | Zone:
+        """What the regulator was asked for at sample k; of so many samples from it on where it saw ahead."""
+        ahead = self.live[k].reference if self.live else None
+        if ahead is not None:
+            return ahead
+        part: Any = k
+        if samples is not None and not self.live:
+            part = np.minimum(np.arange(k, k + samples), len(self.t) - 1)
+        return self.r[part] if self.zone is None else Zone(self.zone.low[part], self.zone.high[part])
 
 
 @dataclass(frozen=True)
@@ -131,7 +149,7 @@ class Difference:
 
 def replay(
     regulator: Regulator,
-    state: RegulatorState,
+    state: RegulatorState | None,
     recording: Recording,
     *,
     preview: bool = False,
@@ -141,9 +159,9 @@ def replay(
 
     Args:
         regulator: a new one, as it was then.
-        state: from which the recording began.
+        state: from which the recording began; None for the one that a `Recorder` wrote down.
         recording: what the regulator was told and decided.
-        preview: whether it saw the reference over its horizon.
+        preview: whether it saw the reference of a simulated run over its horizon.
         tolerance: of times, inputs and objectives, relative to their size (at least one unit); 0 for the same bits.
 
     Returns:
@@ -157,25 +175,27 @@ def replay(
             f"replay: expected a recording of {model.n_inputs} inputs, {model.n_outputs} outputs and "
             f"{model.n_disturbances} measured disturbances, received {m}, {l} and {d}"
         )
-    horizon = regulator.controller.problem.prediction_horizon
+    samples = regulator.controller.problem.prediction_horizon + 1 if preview else None
     for k, t in enumerate(recording.t.tolist()):
-        part: Any = np.minimum(np.arange(k, k + horizon + 1), len(recording.t) - 1) if preview else k
-        asked: Any = recording.r[part]
-        if recording.zone is not None:
-            asked = Zone(recording.zone.low[part], recording.zone.high[part])
+        told: dict[str, Any] = recording.live[k].told if recording.live else {}
+        if recording.live and recording.live[k].state and (k > 0 or state is None):
+            state = regulator.state_from_json(recording.live[k].state)
+        if state is None:
+            raise MampcError("replay: expected a state from which the recording began, received none")
         decision = regulator.step(
             state,
             recording.y[k],
-            asked,
+            recording.asked(k, samples),
             measured_disturbance=recording.v[k] if model.n_disturbances else None,
             variant=recording.variant[k] or None,
+            **told,
         )
         state = decision.state
         for name, said, says in (
             ("the status", recording.status[k], decision.status.value),
-            ("the remarks", recording.remarks[k], told(decision)["remarks"]),
-            ("the ignored outputs", recording.ignored[k], told(decision)["ignored"]),
-            ("the load", recording.load[k], told(decision)["load"]),
+            ("the remarks", recording.remarks[k], told_by(decision)["remarks"]),
+            ("the ignored outputs", recording.ignored[k], told_by(decision)["ignored"]),
+            ("the load", recording.load[k], told_by(decision)["load"]),
         ):
             if said != says:
                 return Difference(k, t, name, said or "none", says or "none")

@@ -150,11 +150,11 @@ class Run:
             for row, d, position in zip(numbers, self.decisions, positions, strict=True):
                 writer.writerow([
                     *row, d.status.value, d.objective, d.lower_bound, d.iterations,
-                    round(d.solve_time * 1e6, 2), *told(d).values(), *position,
+                    round(d.solve_time * 1e6, 2), *told_by(d).values(), *position,
                 ])  # fmt: skip
 
 
-def told(decision: Decision) -> dict[str, str]:
+def told_by(decision: Decision) -> dict[str, str]:
     """What a decision says beside its numbers and its status, by column of a file."""
     ignored = " ".join(f"{y}:{fault}" for y, fault in decision.ignored_outputs.items())
     load = "" if decision.load is None else str(decision.load)

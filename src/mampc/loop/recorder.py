@@ -1,0 +1,197 @@
+"""Recording a live loop: what each step was told and decided, on disk before the next one, for `replay`."""
+
+from __future__ import annotations
+
+import csv
+import json
+import warnings
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from mampc.base.checks import Array, as_instance, as_read, as_shaped
+from mampc.base.csv_table import CSVTable
+from mampc.base.errors import MampcError, MampcWarning, shown
+from mampc.base.names import Names
+from mampc.controllers.decision import Decision
+from mampc.loop.regulator import Regulator
+from mampc.loop.run import told_by
+from mampc.loop.state import RegulatorState
+from mampc.program.problem import Limits
+from mampc.program.zone import Zone
+
+BESIDE = ("limits", "asked", "state")  # columns of a live loop that are JSON, or empty
+
+
+@dataclass(frozen=True, eq=False)
+class Live:
+    """What one sample of a live loop was told beside measurements, reference, disturbances and variant.
+
+    Attributes:
+        told: `u_applied`, `manual` and `limits`, as far as given, as `Regulator.step` takes them.
+        reference: given ahead, shape (np + 1, l), or a `Zone`; None where it was one of shape (l,).
+        state: from which the step began, as text; empty where that was the state after the sample before.
+    """
+
+    told: dict[str, Any]
+    reference: Array | Zone | None
+    state: str
+
+
+class Recorder:
+    """A regulator whose steps are written down as they happen.
+
+    One row a step, on disk before the decision comes back, so that a loop that is killed loses none. Where the disk
+    fails the loop goes on: a `MampcWarning` says so, and nothing more is recorded.
+
+    Args:
+        path: of a CSV file, which must not be there yet.
+        regulator: whose steps are recorded.
+
+    Raises:
+        MampcError: a file that is there, or cannot be written.
+
+    Example:
+        >>> import mampc
+        >>> model = mampc.StateSpace([[0.9]], [[0.1]], [[1.0]], None, dt=1.0)
+        >>> problem = mampc.TrackingProblem(model, prediction_horizon=10, control_horizon=3)
+        >>> regulator = mampc.Regulator(mampc.MPC(problem))
+        >>> folder = getfixture("tmp_path")
+        >>> with mampc.Recorder(folder / "loop.csv", regulator) as recorder:
+        ...     state = regulator.initial_state()
+        ...     for y in ([0.0], [0.1], [0.3]):
+        ...         decision = recorder.step(state, y, [1.0], manual=[False])
+        ...         state = decision.state
+        >>> recording = mampc.Recording.from_csv(folder / "loop.csv", model.names)
+        >>> mampc.replay(regulator, None, recording, tolerance=0.0)
+    """
+
+    def __init__(self, path: str | Path, regulator: Regulator) -> None:
+        self.regulator, self.path = as_instance("regulator", regulator, Regulator), Path(path)
+        model = regulator.controller.problem.model
+        self._dt, self._l, self._m = model.dt, model.n_outputs, model.n_inputs
+        self._shapes, self._samples, self._last = (model.n_disturbances,), 0, None
+        names = model.names
+        try:
+            self._file: Any = self.path.open("x", buffering=1, newline="", encoding="utf-8")
+        except (OSError, ValueError) as error:
+            raise MampcError(f"{path}: expected a new file that can be written, received: {error}") from None
+        self._writer = csv.writer(self._file)
+        self._writer.writerow([
+            "time", *names.inputs, *names.disturbances,
+            *(f"{y}_measured" for y in names.outputs), *(f"{y}_reference" for y in names.outputs),
+            "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored", "load",
+            "variant", *(f"{u}_applied" for u in names.inputs), *(f"{u}_manual" for u in names.inputs), *BESIDE,
+        ])  # fmt: skip
+
+    def step(self, state: RegulatorState, y: Any, reference: Any, **told: Any) -> Decision:
+        """`Regulator.step`, and a row of the file."""
+        decision = self.regulator.step(state, y, reference, **told)
+        if self._file is not None:
+            try:
+                self._writer.writerow(self._row(state, y, reference, decision, **told))
+            except OSError as error:
+                self._file = None
+                warnings.warn(
+                    f"{self.path}: {error}; nothing is recorded from here on", MampcWarning, stacklevel=2
+                )
+        self._samples, self._last = self._samples + 1, decision.state
+        return decision
+
+    def close(self) -> None:
+        """Close the file; steps go on without being recorded."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _row(
+        self,
+        state: RegulatorState,
+        y: Any,
+        reference: Any,
+        decision: Decision,
+        *,
+        u_applied: Any = None,
+        measured_disturbance: Any = None,
+        limits: Limits | None = None,
+        manual: Any = None,
+        variant: str | None = None,
+    ) -> list[Any]:
+        none = [""] * self._m
+        v = np.full(self._shapes, np.nan) if measured_disturbance is None else measured_disturbance
+        asked, ahead = _asked(reference)
+        applied, flags = (
+            none if value is None else as_shaped(name, value, (self._m,)).tolist()
+            for name, value in (("u_applied", u_applied), ("manual", manual))
+        )
+        given = (
+            {} if limits is None else {field.name: getattr(limits, field.name) for field in fields(limits)}
+        )
+        present = {name: as_read(name, value).tolist() for name, value in given.items() if value is not None}
+        return [
+            self._samples * self._dt, *decision.u.tolist(),
+            *as_shaped("measured_disturbance", v, self._shapes).tolist(),
+            *as_shaped("y", y, (self._l,)).tolist(), *asked.tolist(),
+            decision.status.value, decision.objective, decision.lower_bound, decision.iterations,
+            round(decision.solve_time * 1e6, 2), *told_by(decision).values(), *applied, *flags,
+            "" if limits is None else json.dumps(present), ahead, "" if state is self._last else state.to_json(),
+        ]  # fmt: skip
+
+
+def _asked(reference: Any) -> tuple[Array, str]:
+    """The reference of a sample, shape (l,), and all that was asked for as text where that is more."""
+    if isinstance(reference, Zone):
+        centre = reference.centre
+        text = json.dumps({"low": reference.low.tolist(), "high": reference.high.tolist()})
+        return centre if centre.ndim == 1 else centre[0], text
+    rows = as_read("reference", reference)
+    return (rows, "") if rows.ndim == 1 else (rows[0], json.dumps(rows.tolist()))
+
+
+def read_live(table: CSVTable, names: Names) -> tuple[Live, ...]:
+    """What the samples of a file were told beside what every trajectory has; none where no `Recorder` wrote it.
+
+    Raises:
+        MampcError: cells that are not what a `Recorder` writes.
+    """
+    if not set(BESIDE) <= set(table.header):
+        return ()
+    texts = {name: table.words(name) for name in BESIDE}
+    cells = {
+        kind: list(zip(*(table.words(f"{u}_{of}") for u in names.inputs), strict=True))
+        for kind, of in (("u_applied", "applied"), ("manual", "manual"))
+    }
+    rows = []
+    for k in range(len(table)):
+        told: dict[str, Any] = {}
+        try:
+            for kind, words in cells.items():
+                if any(words[k]):
+                    told[kind] = np.array([float(word) for word in words[k]])
+            if texts["limits"][k]:
+                told["limits"] = Limits(**json.loads(texts["limits"][k]))
+            reference = json.loads(texts["asked"][k]) if texts["asked"][k] else None
+            if isinstance(reference, dict):
+                reference = Zone(**reference)
+            elif reference is not None:
+                reference = as_read("asked", reference)
+        except (ValueError, TypeError, RecursionError):
+            cell = " ".join(
+                [texts["limits"][k], texts["asked"][k], *sum((words[k] for words in cells.values()), ())]
+            )
+            raise MampcError(
+                f"{table.path}: expected what a Recorder writes in sample {k}, received {shown(cell)}"
+            ) from None
+        rows.append(Live(told, reference, texts["state"][k]))
+    return tuple(rows)
