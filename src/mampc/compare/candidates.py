@@ -20,9 +20,7 @@ from mampc.program.problem import TrackingProblem
 MOVE_WEIGHTS = (0.1, 0.3)  # times those of plain MPC
 TAILS = (0.0, 0.25, 1.0)  # times the prediction horizon
 CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
-MOST_MOVES = (
-    9  # planned moves of all inputs together, within these, which keeps the patterns to a few hundred
-)
+MOST_MOVES = 9  # of all inputs together, within these, which keeps the patterns to a few hundred
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +66,7 @@ def candidates(problem: TrackingProblem, noise: Array, guessed: bool = False) ->
             for one in (candidate, replace(candidate, guessed=False)):
                 try:
                     one.regulator(1.0)
-                except (
-                    MampcError
-                ):  # such as a tail that an unstable model does not have, or too many patterns
+                except MampcError:  # a tail that an unstable model does not have, or too many patterns
                     continue
                 found.append(one)
                 break

@@ -294,9 +294,7 @@ def _reference(problem: TrackingProblem, around: Surroundings, start: Array, T: 
     rest = model.y_op + model.C @ model.steady_state(start) + model.D[:, : len(start)] @ (start - model.u_op)
     rows, period = np.tile(rest, (T, 1)), T / CHANGES
     unit = np.where(around.noise > 0, around.noise, 1.0)
-    needed = (
-        np.linalg.pinv(gain / unit[:, None], rcond=LEAST_GAIN) / unit
-    )  # of the inputs, per change of the outputs
+    needed = np.linalg.pinv(gain / unit[:, None], rcond=LEAST_GAIN) / unit  # of inputs, per change of outputs
     for number in range(CHANGES):
         at = int((number + 0.5 * rng.random()) * period)
         change = around.reference_changes * rng.uniform(-1, 1, len(rest))

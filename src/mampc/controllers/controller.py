@@ -288,12 +288,8 @@ class Controller(ABC):
             planned += applied
         planned = planned.reshape(self._shape)
         kept = inputs.clipped(planned)
-        if (
-            kept.tobytes() != planned.tobytes()
-            and (  # nearly always the same bits
-                np.abs(kept - planned) > self._resolution + ROUNDED * np.abs(planned)
-            ).any()
-        ):
+        same = kept.tobytes() == planned.tobytes()  # as nearly always
+        if not same and (np.abs(kept - planned) > self._resolution + ROUNDED * np.abs(planned)).any():
             # Planned beyond what counts as a number: this is another plan, of which nothing is proven.
             changes = np.diff(kept, axis=0, prepend=applied)
             status, lower_bound, objective, violations = Status.FEASIBLE, -np.inf, None, None

@@ -36,14 +36,9 @@ LITTLE = 0.2  # a filter's pole that makes no difference
 EQUATIONS, LEAST = 15_000, 1000  # in which orders are compared, and samples
 SIGNIFICANT = 4.0  # a square of two standard deviations
 FILTERED = ("differences", "whitened")  # trends after whose filter nothing is left of levels
-DEGREES = {
-    "none": -1,
-    "constant": 0,
-    "linear": 1,
-    "differences": -1,
-    "whitened": 0,
-}  # of the trend that is fitted
-PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0, "whitened": 0}  # taken off Hankel rows
+# Of the trend that is fitted, and of that taken off Hankel rows.
+DEGREES = {"none": -1, "constant": 0, "linear": 1, "differences": -1, "whitened": 0}
+PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0, "whitened": 0}
 
 Dynamics = Callable[[int], tuple[Array, Array]]  # A and C of an order
 

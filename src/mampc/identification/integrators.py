@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.systems.modes import apart
 
 SLOW = 5.0
 AS_WELL = 1.01  # simulation errors that are as good as equal
@@ -31,18 +32,11 @@ def with_integrators(A: Array, C: Array, count: int) -> tuple[Array, Array]:
     distance = np.sort(np.abs(np.linalg.eigvals(A) - 1.0))
     radius = np.inf if count == n else np.sqrt(distance[count - 1] * distance[count])
     radius = max(radius, distance[count - 1] * (1 + 1e-12))
-    from scipy.linalg import schur, solve_sylvester
-
-    S, Q, found = schur(A, output="real", sort=lambda re, im: np.hypot(re - 1.0, im) <= radius)
+    fixed, T, found = apart(A, lambda pole: abs(pole - 1.0) <= radius)
     if found != count:
         raise ValueError(f"expected {count} poles near one, found {found}")
-    slow, rest = np.s_[:count], np.s_[count:]
-    T = np.eye(n)
-    if count < n:
-        T[slow, rest] = solve_sylvester(S[slow, slow], -S[rest, rest], -S[slow, rest])
-    fixed = np.zeros((n, n))
-    fixed[slow, slow], fixed[rest, rest] = np.eye(count), S[rest, rest]
-    return fixed, C @ Q @ T
+    fixed[:count, :count] = np.eye(count)
+    return fixed, C @ T
 
 
 def explains_as_well(error: float, free: float, independent: float) -> bool:

@@ -298,9 +298,7 @@ def _require_detectable(A: Array, C: Array, disturbance: str) -> None:
         if abs(pole) >= 1 - 1e-9 and all(abs(pole - other) > 1e-9 for other in tested):
             tested.append(pole)
             shown = np.vstack([A - pole * np.eye(n), C / scale])
-            length = np.linalg.norm(
-                shown, axis=0
-            )  # that of a disturbance at an input goes with the input's units
+            length = np.linalg.norm(shown, axis=0)  # a disturbance at an input has the input's units
             seen = np.linalg.svd(shown / np.where(length > 0, length, 1.0), compute_uv=False)[-1]
             if seen < 1e-9:
                 hint = "; for an integrating model use disturbance='input', or the default"

@@ -82,9 +82,9 @@ class AdmissiblePatterns:
     @property
     def unrestricted(self) -> bool:
         """Whether there are no rules at all: every pattern is admissible, at no price and with moves of any size."""
-        free = self.rules.max_moves is None and self.rules.dwell == 1 and self.per_step == self.n_inputs
-        free &= bool(self.candidates.all()) and not self.priced
-        return free and not self.sized and not self.on_levels
+        bounded = self.rules.max_moves is not None or self.rules.dwell > 1 or self.per_step < self.n_inputs
+        bounded |= not bool(self.candidates.all())
+        return not (bounded or self.priced or self.sized or self.on_levels)
 
     def allowance(self, inputs: Array, frozen: Any = None) -> Allowance:
         """What the applied inputs, shape (h, m) with the latest last, allow.
@@ -100,9 +100,7 @@ class AdmissiblePatterns:
                 exceeded = left < 0
             left = min(max(left, 0), self._most)
         if rules.dwell > 1:
-            moved = self._moved(inputs[-rules.dwell :])[
-                ::-1
-            ]  # moved[t]: t + 1 samples before the next decision
+            moved = self._moved(inputs[-rules.dwell :])[::-1]  # moved[t]: t + 1 samples before the decision
             since = np.where(moved.any(axis=0), moved.argmax(axis=0) + 1, rules.dwell)
             until = tuple((rules.dwell - since).tolist())
         if frozen is not None:

@@ -162,11 +162,9 @@ class PatternSolver:
 
     def priced(self, sample: Sample, multipliers: Array | None) -> LeastSquares | None:
         """The problem with limits priced in by multipliers, shape (n_bounds,), if any is not zero."""
-        return (
-            None
-            if multipliers is None or not multipliers.any()
-            else self.condensed.priced(sample, multipliers)
-        )
+        if multipliers is None or not multipliers.dot(multipliers) > 0:
+            return None
+        return self.condensed.priced(sample, multipliers)
 
     def solve(
         self,
@@ -267,9 +265,8 @@ class PatternSolver:
         moves[pattern] = chosen
         if (np.abs(chosen) < ROUNDING * self.condensed.move_prefix[pattern]).any():
             moves = without_rounding(self.condensed, sample, moves)
-            if (
-                sample.later_data is None
-            ):  # with it the pattern counts: what later data decide may be nothing as yet
+            # With later data the pattern counts: what these will decide may be nothing as yet.
+            if sample.later_data is None:
                 objective = self.condensed.cost(sample, moves) + self.admissible.charge(moves != 0)
         return OnPattern(moves, objective, QPStatus.OPTIMAL, multipliers, 1)
 

@@ -21,7 +21,7 @@ from mampc.plants.plant import Plant
 # Tight enough that the simulation error stays far below any measurement noise.
 RTOL, ATOL = 1e-7, 1e-8
 LENIENT = (
-    5.0  # an explicit step's estimate is the error of fourth order; its end, of fifth, is far more exact
+    5.0  # an explicit step's estimate is its error of fourth order; the end, of fifth, is far more exact
 )
 
 # Each stage as a combination of the rates before it (the last one is the end), and the difference of the end from

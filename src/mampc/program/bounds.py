@@ -33,8 +33,7 @@ class Bounds:
 
     Attributes:
         every_move: whether every move has a simple bound; if not, the first inputs have.
-        n_limited: how many outputs are limited.
-        n_violations: these, and how many errors of zones there are.
+        n_violations: limited outputs, and errors of zones.
         violation_cost: of all violations.
         n_simple: violations and moves with simple bounds.
         size: how many there are.
@@ -57,7 +56,7 @@ class Bounds:
         m, l, n = problem.model.n_inputs, problem.model.n_outputs, theta.shape[1]
         self.every_move = every_move or bool(np.isfinite(limits.du_max).any())
         limited = np.isfinite(limits.y_min) | np.isfinite(limits.y_max)
-        self.n_limited = v_limited = int(limited.sum())
+        v_limited = int(limited.sum())
         self.zones = ZoneRows(problem, prediction, parameter) if problem.zoned.any() else None
         n_zones = 0 if self.zones is None else len(self.zones.root)
         self.n_violations = v = v_limited + n_zones

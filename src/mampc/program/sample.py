@@ -17,7 +17,7 @@ Indices = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 class Parts(NamedTuple):
-    """Where each quantity stands in the data of an optimum or an sample."""
+    """Where each quantity stands in the data of an optimum or a sample."""
 
     margins: slice
     moves: slice

@@ -7,11 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import (
-    Field,
-    InstanceOf,
-    model_validator,
-)
+from pydantic import Field, InstanceOf, model_validator
 
 from mampc.base.errors import MampcError
 from mampc.loop.reference_filter import ReferenceFilter
@@ -260,9 +256,7 @@ class ControllerTable(Table):
 
 
 class EstimatorTable(Table):
-    kind: Literal["usual", "kalman_filter", "load_bank"] = (
-        "usual"  # usual: what each controller has by default
-    )
+    kind: Literal["usual", "kalman_filter", "load_bank"] = "usual"  # what each controller has by default
     value_of_information: bool = False
     price_follows_noise: bool = False
     disturbance: Literal["auto", "output", "input"] = "auto"

@@ -15,6 +15,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError
+from mampc.systems.modes import apart
 from mampc.systems.pairs import NEGLIGIBLE, SLOWEST_FREE, Pair, delayed, joined
 from mampc.systems.state_space import StateSpace
 
@@ -103,22 +104,16 @@ def _stretched(A: Array, B: Array, C: Array, lag: float) -> tuple[Array, Array, 
     """The same with all time constants multiplied; poles that belong to no lag stay."""
     if lag == 1.0 or not len(A):
         return A, B, C
-    from scipy.linalg import expm, logm, schur, solve_sylvester
+    from scipy.linalg import expm, logm
 
-    def slow(re: float, im: float) -> bool:
-        return bool(abs(complex(re, im)) > SLOWEST_FREE and (re > 0 or abs(im) > SLOWEST_FREE))
-
-    T, Z, count = schur(A, output="real", sort=slow)
-    # Block diagonal: lags first, the rest behind.
-    X = solve_sylvester(T[:count, :count], -T[count:, count:], -T[:count, count:])
-    B, C = Z.T @ B, C @ Z
-    B[:count] -= X @ B[count:]
-    C[count:] = C[:count] @ X + C[count:]
-    T[:count, count:] = 0.0
+    A, T, count = apart(
+        A, lambda pole: abs(pole) > SLOWEST_FREE and (pole.real > 0 or abs(pole.imag) > SLOWEST_FREE)
+    )
+    B, C = np.linalg.solve(T, B), C @ T
     if count:
         # Over one sample with an input held: exp(F) = [[A, B], [0, 1]], and time runs by 1 / lag of it.
         held = np.eye(count + 1)
-        held[:count, :count], held[:count, count] = T[:count, :count], B[:count]
+        held[:count, :count], held[:count, count] = A[:count, :count], B[:count]
         slowed = np.real(expm(np.real(logm(held)) / lag))
-        T[:count, :count], B[:count] = slowed[:count, :count], slowed[:count, count]
-    return T, B, C
+        A[:count, :count], B[:count] = slowed[:count, :count], slowed[:count, count]
+    return A, B, C

@@ -18,6 +18,7 @@ import numpy as np
 from mampc.base.checks import Array, as_array, as_number, require_finite
 from mampc.base.errors import MampcError
 from mampc.systems.model_file import MOST_STATES
+from mampc.systems.state_space import StateSpace
 
 MOST_COEFFICIENTS = 2000
 LARGEST_HANKEL = 2000  # columns of the Hankel matrix; its decomposition takes the cube of it
@@ -46,7 +47,7 @@ def step_model(S: Any, accuracy: float) -> Matrices:
     tails, settled = _tails(S, accuracy)
     for A, B, C, D in _truncations(settled):
         matrices = _beside((A, B, C, D), tails)
-        if (np.abs(_response(matrices, len(S)) - S) <= allowed).all():
+        if (np.abs(StateSpace(*matrices, dt=1.0).step_response(len(S)) - S) <= allowed).all():
             A, B, C, D = matrices
             return A, B * columns, rows[:, None] * C, rows[:, None] * D * columns
     raise MampcError(
@@ -87,15 +88,13 @@ def _tails(S: Array, accuracy: float) -> tuple[Matrices, Array]:
         settles = ~integrates & (decay >= np.exp(-1.0))
         poles = np.where(settles, np.where(settles, decay, 1.0) ** (1 / span), poles)
         slopes = np.where(integrates, now / span, 0.0)
-    A, B, C = _integrators(slopes, accuracy)
+    tails: Matrices = *_integrators(slopes, accuracy), np.zeros((l, m))
     for i, j in np.argwhere(poles > 0).tolist():
         p = poles[i, j]
         last = (S[-1, i, j] - S[-1 - span, i, j]) * (1 - p) / (p**-span - 1)  # the next change is p times it
-        A = np.block([[A, np.zeros((len(A), 1))], [np.zeros((1, len(A))), np.array([[p]])]])
-        B = np.vstack([B, np.eye(m)[j : j + 1]])
-        C = np.hstack([C, last * p ** -(N - 2.0) * np.eye(l)[:, i : i + 1]])
-    tails = A, B, C, np.zeros((l, m))
-    return tails, S - _response(tails, N)
+        C = last * p ** -(N - 2.0) * np.eye(l)[:, i : i + 1]
+        tails = _beside(tails, (np.array([[p]]), np.eye(m)[j : j + 1], C, np.zeros((l, m))))
+    return tails, S - StateSpace(*tails, dt=1.0).step_response(N)
 
 
 def _integrators(slopes: Array, accuracy: float) -> tuple[Array, Array, Array]:
@@ -143,15 +142,3 @@ def _beside(one: Matrices, other: Matrices) -> Matrices:
     n, q = len(one[0]), len(other[0])
     A = np.block([[one[0], np.zeros((n, q))], [np.zeros((q, n)), other[0]]])
     return A, np.vstack([one[1], other[1]]), np.hstack([one[2], other[2]]), one[3] + other[3]
-
-
-def _response(matrices: Matrices, samples: int) -> Array:
-    """The step response, (samples, l, m)."""
-    A, B, C, D = matrices
-    pulses = np.empty((samples, *D.shape))
-    pulses[0] = D
-    for k in range(1, samples):
-        pulses[k] = C @ B
-        B = A @ B
-    response: Array = np.cumsum(pulses, axis=0)
-    return response

@@ -127,9 +127,7 @@ def _encoding(path: str | Path, content: bytes, findings: Findings) -> str:
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     zeros = content[:2000].count(0)
-    if (
-        zeros > len(content[:2000]) / 3
-    ):  # letters of Latin scripts in two bytes each, without a mark of their order
+    if zeros > len(content[:2000]) / 3:  # two bytes a letter of Latin scripts, without a mark of their order
         return "utf-16-be" if content[0] == 0 else "utf-16-le"
     if BINARY.search(content[:65536]):
         raise MampcError(f"{path}: expected a readable {KIND}, received something else")

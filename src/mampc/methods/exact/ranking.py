@@ -66,9 +66,8 @@ class Ranking:
     def rows(self, past: Allowance) -> slice:
         """Where the patterns stand among which the best one is, given the past."""
         rows = self._rows_within[min(past.left, len(self._rows_within) - 1)]
-        return (
-            slice(0, rows.stop) if any(past.frozen) else rows
-        )  # frozen inputs may leave part of the budget unspent
+        # Frozen inputs may leave part of the budget unspent.
+        return slice(0, rows.stop) if any(past.frozen) else rows
 
     def bounds(
         self, free: Array, least: float, past: Allowance, later_data: LaterData | None = None
@@ -109,10 +108,8 @@ class Ranking:
     def squares(self) -> Array:
         """The table as symmetric matrices, shape (K, n_moves, n_moves)."""
         n = self.condensed.n_moves
-        squares, halves = (
-            np.empty((len(self.table), n, n)),
-            self.table * np.where(self._rows == self._columns, 1.0, 0.5),
-        )
+        halves = self.table * np.where(self._rows == self._columns, 1.0, 0.5)
+        squares = np.empty((len(self.table), n, n))
         squares[:, self._rows, self._columns] = squares[:, self._columns, self._rows] = halves
         return squares
 
@@ -124,9 +121,8 @@ class Ranking:
     @cached_property
     def _to_x(self) -> Array:
         """x per target."""
-        to_x: Array = self.condensed.lengths[:, None] * self.condensed.plain.optimum(
-            np.eye(self.condensed.n_moves)
-        )
+        optimum = self.condensed.plain.optimum(np.eye(self.condensed.n_moves))
+        to_x: Array = self.condensed.lengths[:, None] * optimum
         return to_x
 
     def rounding(self, x: Array) -> float:
@@ -135,11 +131,9 @@ class Ranking:
 
     def charges(self, rows: Indices | slice, later_data: LaterData | None) -> Array:
         """What patterns cost beside, shape (rows,)."""
-        return (
-            self.charge[rows]
-            if later_data is None
-            else (self.charge + later_data.charges(self.patterns))[rows]
-        )
+        if later_data is None:
+            return self.charge[rows]
+        return (self.charge + later_data.charges(self.patterns))[rows]
 
     def lift(self, x: Array, rows: slice | Indices) -> Array:
         """How much more patterns cost at least because their optima have moves below their least size.

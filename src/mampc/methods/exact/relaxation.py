@@ -47,10 +47,8 @@ class Multipliers(NamedTuple):
     @property
     def infeasible(self) -> bool:
         """Whether no moves keep the limits."""
-        return self.status in (
-            QPStatus.INFEASIBLE,
-            QPStatus.BAD_DATA,
-        )  # data are finite here, so bounds crossed
+        # Data are finite here: bad ones are bounds that cross.
+        return self.status in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA)
 
     @property
     def solved(self) -> bool:

@@ -32,7 +32,7 @@ from mampc.moves.pattern_solver import Incumbent, OnPattern, PatternSolver
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.qp import QPStatus
-from mampc.program.sample import LeastSquares, Sample
+from mampc.program.sample import Sample
 
 MOST_BESIDE_LEVELS = 1000  # patterns of inputs without levels that are tried one by one
 TOGETHER = 3  # patterns of the table whose limits are priced together
@@ -172,7 +172,7 @@ class ExactSearch:
         rounding, open_ = condensed.rounding(sample), OpenPatterns(ranking, sample, past, bounds)
         if sample.margins.min(initial=np.inf) < 0:
             plain = condensed.plain.nearest(sample.target, sample.both_bounds)
-            first = _priced(condensed, sample, plain.multipliers)
+            first = solver.priced(sample, plain.multipliers)
             if first is not None:
                 open_.price(first, np.inf)
         relaxation = None if self._relaxation is None else self._relaxation.at(sample, sample.moves)
@@ -190,13 +190,13 @@ class ExactSearch:
             cutoff = best.objective - tie(best.objective, rounding)
             if open_.best()[1] >= cutoff:
                 continue
-            limits = _priced(condensed, sample, solved.multipliers)
+            limits = solver.priced(sample, solved.multipliers)
             if limits is not None:
                 open_.price(limits, cutoff)
                 # What limits moves that this pattern does not make shows with those of the best ones left together.
                 if relaxation is not None and len(few := open_.first(TOGETHER)):
                     made = np.asarray(ranking.patterns[few].any(axis=0))
-                    together = _priced(condensed, sample, relaxation.with_moves(sample, made))
+                    together = solver.priced(sample, relaxation.with_moves(sample, made))
                     if together is not None:
                         open_.price(together, cutoff)
 
@@ -223,10 +223,3 @@ class ExactSearch:
             return Plan(hold, status, best.solved, bound, remarks=remarks)
         lower = None if status is Status.OPTIMAL else min(bound, best.objective)
         return Plan(best.moves, status, best.solved, lower, None, None, best.objective, remarks)
-
-
-def _priced(condensed: CondensedQP, sample: Sample, multipliers: Array | None) -> LeastSquares | None:
-    """The cost with limits priced in by multipliers, if any is not zero."""
-    if multipliers is None or not multipliers.dot(multipliers) > 0:
-        return None
-    return condensed.priced(sample, multipliers)

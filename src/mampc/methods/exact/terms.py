@@ -28,6 +28,7 @@ from mampc.program.qp import UNBOUNDED
 from mampc.program.sample import Indices, Sample
 
 MOST_TERMS = 8  # that nodes are bounded with
+UNLIMITED = 1e15  # no limit of an input is as large
 UNEVEN = 1e4  # condition of U from which a step of refinement pays
 
 
@@ -234,6 +235,3 @@ class Domain:
     def support(self, s: Array) -> Array:
         """The largest s d of each move, which may be zero, shape (n,)."""
         return np.asarray(np.maximum(np.maximum(s * self.low, s * self.high), 0.0))
-
-
-UNLIMITED = 1e15  # no limit of an input is as large
