@@ -1,0 +1,192 @@
+"""What is estimated from records: the trend, the dead times and whose poles, by what predicts held-out data."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mampc.base.checks import Array, as_whole
+from mampc.base.errors import MampcError
+from mampc.identification.arx import estimate_arx
+from mampc.identification.closed_loop import estimate_predictor
+from mampc.identification.delays import Integers, find_delays
+from mampc.identification.estimate import Settings, estimate
+from mampc.identification.held_out import AS_GOOD, CLEARLY, RIVAL, WALK, compared, errors, split
+from mampc.identification.parts import Part, groups
+from mampc.identification.scaling import Scaled
+
+TRENDS = {
+    "none": "nothing was taken off the record",
+    "constant": "constants were fitted",
+    "linear": "a line in time was fitted to each output",
+    "differences": "changes were explained, as outputs that drift ask for",
+    "whitened": "disturbances were made white first, as their colour or a loop that was closed ask for",
+}
+ENOUGH = 20_000  # samples in which choices are compared
+SHORT = 3  # samples of dead time that are left to the states
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is estimated: the trend, the dead times (l, m), and whether by the rival or from predictors."""
+
+    trend: str
+    delays: Integers
+    rival: bool = False
+    predictor: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        late = "with dead times" if self.delays.any() else "without dead times"
+        return f"{'ARX' if self.rival else 'subspace'} models, trend: {self.trend}, {late}"
+
+
+class Score(NamedTuple):
+    """Of a choice on held-out data: see `held_out.errors`; and how many integrators and states it takes."""
+
+    error: float
+    walk: float
+    level: float
+    integrators: int
+    states: int
+
+
+def estimated(
+    records: Scaled,
+    settings: Settings,
+    choice: Choice,
+    values: list[Array] | None = None,
+    orders: Sequence[int] | None = None,
+) -> list[Part]:
+    """The parts of a model, of given orders if any; appends the singular values of each."""
+    if choice.predictor:
+        return [estimate_predictor(records, settings.feedthrough, None if orders is None else orders[0])[0]]
+    if choice.rival or choice.trend == "whitened":
+        return estimate_arx(records, choice.delays, settings, choice.trend, orders)
+    parts = []
+    for k, (outputs, delays) in enumerate(groups(choice.delays)):
+        fixed = settings if orders is None else replace(settings, order=orders[k])
+        part, own = estimate(records, outputs, delays, fixed, choice.trend)
+        parts.append(part)
+        if values is not None:
+            values.append(own)
+    return parts
+
+
+def chosen(
+    records: Scaled, settings: Settings, detrend: str, delays: Integers | None, feedback: bool,
+    tell: Callable[[str], None],
+) -> Choice:  # fmt: skip
+    """Trend, dead times and rival by what predicts the held-out part of the records."""
+    m, l = records.u[0].shape[1], records.y[0].shape[1]
+    none = np.zeros((l, m), dtype=int)
+    tell("looking for dead times")
+    found = find_delays(records.u, records.y) if delays is None else delays
+    if delays is None and found.max() <= SHORT:
+        found = none
+    front, back = split(records.shortened(ENOUGH))
+    notes: list[str] = []
+
+    def scored(choice: Choice) -> Score:
+        tell(f"trying {choice.words}")
+        try:
+            s = block_rows_for(
+                [len(u) - int(choice.delays.max()) for u in front.u], m, l, settings.order, None
+            )
+            trial = replace(settings, block_rows=min(s, settings.block_rows))
+            parts = estimated(front, trial, choice)
+        except (MampcError, np.linalg.LinAlgError):
+            return Score(np.inf, 0.0, np.inf, 0, 0)
+        found = errors(parts, back, coloured=feedback)
+        return Score(*found, sum(part.integrators for part in parts), sum(len(part.A) for part in parts))
+
+    trends = ("constant", "linear", "differences") if detrend == "auto" else (detrend,)
+    choices = [Choice(trend, found) for trend in trends]
+    scores = [scored(choice) for choice in choices]
+    if detrend == "auto" and (feedback or scores[0].walk > WALK):
+        trends = (*trends, "whitened")
+        choices.append(Choice("whitened", found))
+        scores.append(scored(choices[-1]))
+    # Where inputs excite too little for anything else, white disturbances say nothing.
+    telling = [score for trend, score in zip(trends, scores, strict=True) if trend != "whitened"] or scores
+    if not any(np.isfinite(score.error) for score in telling):
+        why = "Too short to hold a part out, so that nothing was compared"
+        return Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
+    # A drift passes for an integrator or a slow mode that inputs hardly move: the fewest of these win, and among
+    # equals changes are explained where what is left of levels walks, else the simplest. Noise is made white only
+    # where it is not, as levels say nothing then. They say nothing under feedback either: inputs answer disturbances.
+    first = scores[0]
+
+    def is_fair(k: int) -> bool:
+        score = scores[k]
+        if feedback:
+            return bool(np.isfinite(score.error))
+        if trends[k] == "whitened":
+            alike = score.level <= first.level + CLEARLY and score.states <= first.states
+            return min(score.walk, first.walk) > WALK and alike
+        simple = score.level <= first.level + CLEARLY and score.states <= first.states
+        return k == 0 or simple or score.error < first.error - CLEARLY
+
+    fair = [k for k in range(len(trends)) if is_fair(k)]
+    least = min(scores[k].error for k in fair)
+    near = [k for k in fair if scores[k].error <= least + AS_GOOD]
+    walks = scores[near[0]].walk > WALK
+
+    def rank(k: int) -> tuple[bool, int, int, bool, int]:
+        white = feedback and trends[k] != "whitened"
+        return white, scores[k].integrators, scores[k].states, walks and trends[k] != "differences", k
+
+    best = min(near, key=rank)
+    choice, score = choices[best], scores[best].error
+    said = f"Trend: {TRENDS[choice.trend]}"
+    if feedback:
+        said += "; past outputs moved the inputs"
+    if best:
+        said += f"; this predicts held-out data {compared(score, scores[0].error)} constants"
+    notes.append(f"{said}.")
+    if delays is None and found.any():
+        without = scored(replace(choice, delays=none)).error
+        if without < score - AS_GOOD:
+            choice, score = replace(choice, delays=none), without
+        else:
+            spans = ", ".join(map(str, np.unique(found[found > 0])))
+            notes.append(
+                f"Dead times of {spans} samples; they predict held-out data {compared(score, without)} none."
+            )
+    if settings.order is None and choice.trend != "whitened":
+        rival = scored(replace(choice, rival=True)).error
+        wins = rival < score - RIVAL
+        choice = replace(choice, rival=wins)
+        poles, other = ("ARX", "subspace") if wins else ("Subspace", "ARX")
+        said = compared(min(rival, score) if wins else score, score if wins else rival)
+        notes.append(f"{poles} poles; they predict held-out data {said} {other} ones.")
+    return replace(choice, notes=tuple(notes))
+
+
+def block_rows_for(samples: list[int], m: int, l: int, order: int | None, block_rows: int | None) -> int:
+    if order is not None:
+        as_whole("order", order, 1)
+    least = 2 if order is None else -(-order // l) + 1
+
+    # 2 s (m + l) Hankel rows want at least as many columns, N - 2 s + 1 of each record.
+    def fits(s: int) -> bool:
+        return 2 * s * (m + l) <= sum(max(0, N - 2 * s + 1) for N in samples)
+
+    most = bisect_left(range(1, max(samples) + 1), True, key=lambda s: not fits(s))
+    total = sum(samples)
+    if most < least:
+        raise MampcError(
+            f"n4sid: expected at least {2 * (m + l + 1) * least - 1} samples for {m} inputs, {l} outputs"
+            f"{'' if order is None else f' and order {order}'}, received {total}"
+        )
+    if block_rows is None:
+        return max(least, min(max(15, least + 5), total // (8 * (m + l)), most))
+    s = as_whole("block_rows", block_rows, least)
+    if s > most:
+        raise MampcError(f"block_rows: expected at most {most} for {total} samples, received {s}")
+    return s
