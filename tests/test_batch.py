@@ -269,7 +269,7 @@ def test_the_best_pattern_is_that_of_the_search():
         ({"seeds": [0], "plant": None}, "plant: expected a plant"),
         ({"seeds": [0], "reference": [[1.0], [1.0, 2.0]]}, "reference: expected real numbers"),
         ({"seeds": [0], "output_disturbance": "much"}, "output_disturbance: expected real numbers"),
-        ({"seeds": [0], "valves": 1.0}, "valves: expected mampc.Valves"),
+        ({"seeds": [0], "valves": 1.0}, "valves: expected a mampc.Valves"),
         (
             {"seeds": [0, 1], "output_disturbance": np.zeros((3, 20, 2))},
             "output_disturbance: expected a course",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 
@@ -24,3 +25,9 @@ def shown(value: Any, length: int = 60) -> str:
     except (ValueError, RecursionError):  # a number of too many digits, a list too deep in lists
         text = f"{type(value).__name__} too long to be shown"
     return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def listed(words: Sequence[str], most: int = 6, separator: str = ", ") -> str:
+    """The first words, and how many there are beside them: "u1, u2 and 3 more"."""
+    more = f" and {len(words) - most} more" if len(words) > most else ""
+    return separator.join(words[:most]) + more

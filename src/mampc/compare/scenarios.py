@@ -15,12 +15,13 @@ import numpy as np
 from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError
 from mampc.loop.batch import simulate_batch
-from mampc.loop.disturbances import response_within_reach
-from mampc.loop.kalman_filter import static_response
+from mampc.loop.disturbances import input_units, response_within_reach
+from mampc.loop.load_bank import NOISE_OF_REACH
 from mampc.loop.loads import Coloured, Load, RandomSteps, RandomWalk, drawn
 from mampc.loop.regulator import Regulator
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.mismatch import Mismatch
+from mampc.systems.noise import white_noise
 from mampc.systems.state_space import StateSpace
 
 SETTLED = 0.05  # share of a step response's largest value that may be missing where it has settled
@@ -31,7 +32,6 @@ FREE_MOVES = 5  # control horizon of plain MPC
 CONDITION = 500.0  # of the program that the move weight of plain MPC aims at, as in dynamic matrix control
 
 LEAST_GAIN = 1e-3  # of the largest: directions that answer less are not asked for
-NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 CHANGE = 10.0  # times the noise: how far set-points go, either way
 CHANGES = 4  # set-point changes of a scenario
 LENGTHS = (160, 300)  # fewest and most samples of a scenario
@@ -71,8 +71,7 @@ class Surroundings:
         """
         model = problem.model
         l = model.n_outputs
-        if noise is None and model.noise is not None and (model.noise.output > 0).all():
-            noise = model.noise.output
+        noise = white_noise(model.noise) if noise is None else noise
         guessed = noise is None
         if noise is None:
             noise = NOISE_OF_REACH * np.abs(response_within_reach(model)) @ _range(problem, "noise")
@@ -103,8 +102,7 @@ def _given(loads: Any) -> tuple[tuple[Load, ...], ...]:
 
 def every_kind(model: StateSpace, noise: Array, samples: int) -> tuple[tuple[Load, ...], ...]:
     """Loads of every kind at the inputs, the last of them none."""
-    effect = np.linalg.norm(response_within_reach(model) / noise[:, None], axis=0) / np.sqrt(len(noise))
-    unit = np.where(effect > 0, 1 / np.where(effect > 0, effect, 1.0), 0.0)
+    unit = input_units(response_within_reach(model), noise)
     return (
         (RandomSteps(size=STEP * unit, every=samples * model.dt / 2),),
         (RandomWalk(size=WALK * unit),),
@@ -290,7 +288,7 @@ def _reference(problem: TrackingProblem, around: Surroundings, start: Array, T: 
     """Set-points of one scenario, shape (T, l): levels that change all at once, a few times."""
     model, limits = problem.model, problem.limits
     rng = np.random.default_rng([seed, 0x52])
-    gain = static_response(model)
+    gain = _steady_gain(model)
     rest = model.y_op + model.C @ model.steady_state(start) + model.D[:, : len(start)] @ (start - model.u_op)
     rows, period = np.tile(rest, (T, 1)), T / CHANGES
     unit = np.where(around.noise > 0, around.noise, 1.0)
@@ -303,6 +301,15 @@ def _reference(problem: TrackingProblem, around: Surroundings, start: Array, T: 
         level = rest + change
         rows[at:] = np.clip(level, limits.y_min, limits.y_max)
     return rows
+
+
+def _steady_gain(model: StateSpace) -> Array:
+    """Output changes per unit of input, shape (l, m): steady, or after 10 samples where the model integrates."""
+    try:
+        gain = model.dc_gain()
+    except MampcError:
+        gain = model.step_response(11)[-1]
+    return gain[:, : model.n_inputs]
 
 
 def _range(problem: TrackingProblem, name: str) -> Array:

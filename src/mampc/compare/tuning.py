@@ -27,7 +27,7 @@ from mampc.loop.load_bank import LoadBank
 from mampc.loop.regulator import Regulator
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
-from mampc.systems.state_space import StateSpace
+from mampc.systems.state_space import StateSpace, as_discrete
 
 SEARCHED, REFINED, CONFIRMED = 8, 16, 32  # scenarios of the three rounds
 SEARCH_PRICES, REFINE_PRICES = 6, 11
@@ -231,13 +231,10 @@ def _plain(
     model: StateSpace, limits: Limits | None, output_weight: Any, baseline: Regulator | None
 ) -> Regulator:
     """Plain MPC to compare with."""
-    if not isinstance(model, StateSpace):
-        raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
+    as_discrete("model", model)
     if baseline is None:
         if limits is None:
             raise MampcError("limits: expected mampc.Limits with u_min and u_max, received none")
-        if not model.is_discrete:
-            raise MampcError("model: expected a discrete model, received dt = 0; use model.discretise(dt)")
         problem = usual_problem(model, limits, output_weight)
         return Regulator(MPC(problem), KalmanFilter.offset_free(model))
     if not isinstance(baseline, Regulator) or type(baseline.controller) is not MPC:

@@ -10,7 +10,16 @@ from typing import Any, Self
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray, as_array, as_number, as_shaped, as_vector, is_usable
+from mampc.base.checks import (
+    Array,
+    BoolArray,
+    as_array,
+    as_instance,
+    as_number,
+    as_shaped,
+    as_vector,
+    is_usable,
+)
 from mampc.base.errors import MampcError
 from mampc.base.tolerances import INSIDE, SAME
 from mampc.base.words import Remark, Status
@@ -62,9 +71,7 @@ class Controller(ABC):
         condensed: CondensedQP | None = None,
         levels: Any = None,
     ) -> None:
-        if not isinstance(problem, TrackingProblem):
-            raise MampcError(f"problem: expected a mampc.TrackingProblem, received {type(problem).__name__}")
-        self.problem = problem
+        self.problem = as_instance("problem", problem, TrackingProblem)
         if time_limit is not None:
             time_limit = as_number("time_limit", time_limit, 0.0, exclusive=True)
         if condensed is None:

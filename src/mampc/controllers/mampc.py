@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_vector
+from mampc.base.checks import Array, as_instance, as_vector
 from mampc.base.errors import MampcError
 from mampc.base.tolerances import ROUNDING, SAME, URGENT
 from mampc.base.words import Remark, Status
@@ -56,8 +56,7 @@ class MAMPC(Controller):
         violation_margin: Any = 0.0,
         **settings: Any,
     ) -> None:
-        if not isinstance(rules, MoveRules):
-            raise MampcError(f"rules: expected mampc.MoveRules, received {type(rules).__name__}")
+        as_instance("rules", rules, MoveRules)
         every = bool(np.any(rules.min_size)) or rules.levels is not None
         super().__init__(problem, bound_every_move=every, levels=rules.levels)
         if on_limit_violation not in ON_LIMIT_VIOLATION:

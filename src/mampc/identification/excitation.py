@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.base.errors import listed
 from mampc.identification.data import IOData
 from mampc.systems.properties import doubtful_gains, properties, time_in_words
 from mampc.systems.state_space import StateSpace
@@ -57,10 +58,9 @@ def left_open(model: StateSpace, records: Sequence[IOData]) -> list[str]:
     said = movement_of(records)
     doubtful = doubtful_gains(model, found)
     if doubtful:
-        listed = ", ".join(doubtful[:6]) + (f" and {len(doubtful) - 6} more" if len(doubtful) > 6 else "")
         said.append(
-            f"the sign of the gain is uncertain: {listed}; move these inputs further, for longer and one without the "
-            "other, unless no effect is to be expected"
+            f"the sign of the gain is uncertain: {listed(doubtful)}; move these inputs further, for longer and one "
+            "without the other, unless no effect is to be expected"
         )
     lasted = max(map(len, records)) * model.dt
     if found.settling_time > 0 and lasted < SHORT * found.settling_time:

@@ -28,9 +28,10 @@ from mampc.base.checks import (
     as_whole,
     require_finite,
 )
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, listed
 from mampc.base.files import written_whole
 from mampc.base.names import Names, require_count
+from mampc.systems.noise import white_noise
 from mampc.systems.properties import properties, time_in_words
 from mampc.systems.signals import prbs
 from mampc.systems.state_space import StateSpace
@@ -194,7 +195,8 @@ def first_guess(model: StateSpace) -> dict[str, Any]:
     """
     found = properties(model)
     m = model.n_inputs
-    if model.noise is None or not (model.noise.output > 0).all():
+    noise = white_noise(model.noise)
+    if noise is None:
         raise MampcError(
             "expected a model with the noise of its outputs, received one without; pass it (--noise)"
         )
@@ -211,7 +213,7 @@ def first_guess(model: StateSpace) -> dict[str, Any]:
     )
     return {
         "gain": gain, "dead_time": dead, "settling_time": np.maximum(settling, dead + model.dt),
-        "integrating": found.integrating[:, :m], "noise": model.noise.output, "dt": model.dt, "around": model.u_op,
+        "integrating": found.integrating[:, :m], "noise": noise, "dt": model.dt, "around": model.u_op,
         "names": model.names.undisturbed(),
     }  # fmt: skip
 
@@ -294,18 +296,16 @@ def _notes(names: Names, uncertainty: Array, accuracy: float, integrates: BoolAr
     ]
     weak = np.argwhere(uncertainty > 1.05 * accuracy)
     if len(weak):
-        listed = ", ".join(
-            f"{names.outputs[i]} from {names.inputs[j]} ({100 * uncertainty[i, j]:.0f} %)"
-            for i, j in weak[:6]
-        )
-        more = f" and {len(weak) - 6} more" if len(weak) > 6 else ""
+        gains = [
+            f"{names.outputs[i]} from {names.inputs[j]} ({100 * uncertainty[i, j]:.0f} %)" for i, j in weak
+        ]
         notes.append(
-            f"gains less certain than asked for, with these amplitudes in {LONGEST} settling times: {listed}{more}"
+            f"gains less certain than asked for, with these amplitudes in {LONGEST} settling times: {listed(gains)}"
         )
     if integrates.any():
-        listed = ", ".join(names.outputs[i] for i in np.flatnonzero(integrates.any(axis=1))[:6])
+        outputs = listed([names.outputs[i] for i in np.flatnonzero(integrates.any(axis=1))])
         notes.append(
-            f"{listed} integrates: stop or bring it back by hand where it runs away, and record that too"
+            f"{outputs} integrates: stop or bring it back by hand where it runs away, and record that too"
         )
     return notes
 

@@ -54,6 +54,17 @@ def response_within_reach(model: StateSpace) -> Array:
     return picked
 
 
+def input_units(reach: Array, noise: Array) -> Array:
+    """Changes of the inputs, shape (m,), that show in the outputs like their noise; 0 where an input does nothing.
+
+    Args:
+        reach: of `response_within_reach`, shape (l, m).
+        noise: sizes of the outputs, shape (l,).
+    """
+    effect = np.linalg.norm(reach / noise[:, None], axis=0) / np.sqrt(len(noise))
+    return np.where(effect > 0, 1 / np.where(effect > 0, effect, 1.0), 0.0)
+
+
 def state_sizes(A: Array, driven: Array, C: Array) -> Array:
     """Units of the states, shape (n,), in which the units that a model happens to have do not count.
 

@@ -19,7 +19,13 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
-from mampc.loop.disturbances import directions_of, driving_noise, response_within_reach, state_sizes
+from mampc.loop.disturbances import (
+    directions_of,
+    driving_noise,
+    input_units,
+    response_within_reach,
+    state_sizes,
+)
 from mampc.systems.riccati import seen_covariance
 from mampc.systems.state_space import StateSpace
 
@@ -73,12 +79,10 @@ class Loads:
     def of(cls, model: StateSpace, noise: Array) -> Loads:
         m, l = model.n_inputs, model.n_outputs
         reach = response_within_reach(model)
-        effect = np.linalg.norm(reach / noise[:, None], axis=0) / np.sqrt(l)
-        effective = effect > 0
-        unit = np.where(effective, 1 / np.where(effective, effect, 1.0), 0.0)
+        unit = input_units(reach, noise)
         outputs = directions_of(model, "auto", reach, noise, unit).at_outputs
         outputs = outputs[:, outputs.any(axis=0)]
-        inputs = np.diag(unit)[:, effective]
+        inputs = np.diag(unit)[:, unit > 0]
         return cls(
             model, noise,
             np.hstack([inputs, np.zeros((m, outputs.shape[1]))]),

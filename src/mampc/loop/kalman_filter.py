@@ -19,12 +19,14 @@ from mampc.loop.disturbances import (
     alike,
     directions_of,
     driving_noise,
+    input_units,
     response_within_reach,
     state_sizes,
 )
 from mampc.loop.estimator import Estimate, Estimator, Updated
+from mampc.systems.noise import white_noise
 from mampc.systems.riccati import predicted_covariance
-from mampc.systems.state_space import StateSpace
+from mampc.systems.state_space import StateSpace, as_discrete
 
 _ONE = np.ones(1)
 
@@ -90,26 +92,16 @@ class KalmanFilter(Estimator):
             MampcError: a continuous model, or one whose disturbances cannot be told apart from its
                 states with these outputs.
         """
-        if not isinstance(model, StateSpace):
-            raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
-        if not model.is_discrete:
-            raise MampcError("offset_free: expected a discrete model, received dt = 0; discretise it first")
+        as_discrete("model", model)
         if disturbance not in ("auto", "output", "input"):
             raise MampcError(f"disturbance: expected 'auto', 'output' or 'input', received {disturbance!r}")
         n, m, l = model.n_states, model.n_inputs, model.n_outputs
         if disturbance == "input" and m < l:
             raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")
         reach = response_within_reach(model)
-        if measurement_noise is not None:
-            noise = _positive("measurement_noise", measurement_noise, l)
-        elif model.noise is not None and (model.noise.output > 0).all():
-            noise = model.noise.output
-        else:
-            noise = alike(reach)
-        effect = np.linalg.norm(reach / noise[:, None], axis=0) / np.sqrt(l)
-        unit = np.where(
-            effect > 0, 1 / np.where(effect > 0, effect, 1.0), 0.0
-        )  # of inputs: as large as noise
+        noise = white_noise(model.noise) if measurement_noise is None else measurement_noise
+        noise = alike(reach) if noise is None else _positive("measurement_noise", noise, l)
+        unit = input_units(reach, noise)
         directions = directions_of(model, disturbance, reach, noise, unit)
         A, C = _augmented(model, directions)
         _require_detectable(A, C / noise[:, None], disturbance)
@@ -182,17 +174,9 @@ class KalmanFilter(Estimator):
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
         """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
-        parts = (
-            last.x,
-            last.output_disturbance,
-            last.input_disturbance,
-            u,
-            v_last,
-            v,
-            y,
-            np.ones((len(y), 1)),
-        )
-        data = np.concatenate(parts, axis=1) @ self._update.T
+        ones = np.ones((len(y), 1))
+        known = (last.x, last.output_disturbance, last.input_disturbance, u, v_last, v, y, ones)
+        data = np.concatenate(known, axis=1) @ self._update.T
         x, at_outputs, at_inputs, innovation, movement = (data[:, part] for part in self._parts)
         return Updated(Estimate(x, at_outputs, at_inputs), innovation, movement)
 
@@ -228,10 +212,6 @@ class KalmanFilter(Estimator):
         """
         innovation: Array = y - self._output(predicted, self._change(predicted, u, v))
         return innovation
-
-    def correct(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Estimate:
-        """Correct with measurements y (l,), taken as `innovation` says."""
-        return self.corrected(predicted, self.innovation(predicted, u, y, v))
 
     def corrected(
         self,
@@ -307,15 +287,6 @@ def _require_detectable(A: Array, C: Array, disturbance: str) -> None:
                     f"whose mode at {pole:.4g} cannot be told from a disturbance"
                     f"{hint if disturbance == 'output' else ''}"
                 )
-
-
-def static_response(model: StateSpace) -> Array:
-    """Output changes per unit of input, shape (l, m): steady, or after 10 samples where the model integrates."""
-    try:
-        gain = model.dc_gain()
-    except MampcError:
-        gain = model.step_response(11)[-1]
-    return gain[:, : model.n_inputs]
 
 
 def _positive(name: str, value: Any, size: int) -> Array:

@@ -29,7 +29,8 @@ from mampc.loop.disturbances import response_within_reach
 from mampc.loop.hypotheses import INPUT_NOISE, Loads
 from mampc.loop.run import Run
 from mampc.program.sample import Indices
-from mampc.systems.state_space import StateSpace
+from mampc.systems.noise import white_noise
+from mampc.systems.state_space import StateSpace, as_discrete
 
 PRIOR = 0.15  # standard deviation of a gain's share that is not known
 WALKS = (0.1, 0.3, 1.0, 5.0)  # of loads a sample, in loads that show in the outputs like their noise
@@ -78,15 +79,13 @@ def learn_gains(
     Raises:
         MampcError: redundant inputs, records of other signals, sample time or too few samples, or no noise.
     """
-    if not isinstance(model, StateSpace) or not model.is_discrete:
-        raise MampcError(f"model: expected a discrete mampc.StateSpace, received {model!r}")
+    as_discrete("model", model)
     l, m = model.n_outputs, model.n_inputs
     given = list(records) if isinstance(records, Sequence) else [records]
     if not given:
         raise MampcError("records: expected at least one, received none")
     known = [_signals(record, model) for record in given]
-    if noise is None and model.noise is not None and (model.noise.output > 0).all():
-        noise = model.noise.output
+    noise = white_noise(model.noise) if noise is None else noise
     if noise is None:
         raise MampcError(
             "noise: expected the standard deviation of each output's measurement noise, received none"

@@ -31,7 +31,8 @@ from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
 from mampc.loop.mixing import BankEstimate, Filters, Mixing
 from mampc.program.problem import TrackingProblem
-from mampc.systems.state_space import StateSpace
+from mampc.systems.noise import white_noise
+from mampc.systems.state_space import StateSpace, as_discrete
 
 NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
@@ -70,13 +71,10 @@ class LoadBank(Estimator):
         guessed: bool = False,
         hypotheses: tuple[Hypothesis, ...] = HYPOTHESES,
     ) -> None:
-        if not isinstance(model, StateSpace):
-            raise MampcError(f"model: expected a mampc.StateSpace, received {type(model).__name__}")
-        if not model.is_discrete:
-            raise MampcError("LoadBank: expected a discrete model, received dt = 0; discretise it first")
+        as_discrete("model", model)
         if not hypotheses or not all(isinstance(h, Hypothesis) for h in hypotheses):
             raise MampcError("hypotheses: expected at least one Hypothesis")
-        noise = _identified(model) if noise is None else noise
+        noise = white_noise(model.noise) if noise is None else noise
         if noise is None:
             raise MampcError(
                 "noise: expected the standard deviation of each output's measurement noise, received none; "
@@ -120,7 +118,7 @@ class LoadBank(Estimator):
             MampcError: as for `LoadBank`; and inputs without limits where the noise has to be guessed.
         """
         model, limits = problem.model, problem.limits
-        if noise is None and _identified(model) is None:
+        if noise is None and white_noise(model.noise) is None:
             response = np.abs(model.step_response(21)[:, :, : model.n_inputs]).max(axis=0)
             moved = response > 0
             reach = np.where(moved, response, 0.0) @ np.where(
@@ -358,11 +356,6 @@ class LoadBank(Estimator):
         model = self.model
         change: Array = np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op
         return change
-
-
-def _identified(model: StateSpace) -> Array | None:
-    """The noise that an identified model knows of every output, shape (l,), or None."""
-    return model.noise.output if model.noise is not None and (model.noise.output > 0).all() else None
 
 
 def _diagonal(blocks: Array) -> Array:

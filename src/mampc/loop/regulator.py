@@ -83,18 +83,12 @@ class Regulator:
             raise MampcError(
                 f"estimator: expected a KalmanFilter or a LoadBank, received {type(estimator).__name__}"
             )
-        if not isinstance(sensors, SensorChecks | None):
-            raise MampcError(f"sensors: expected SensorChecks, received {type(sensors).__name__}")
-        if not isinstance(reference_filter, ReferenceFilter | None):
-            raise MampcError(
-                f"reference_filter: expected a ReferenceFilter, received {type(reference_filter).__name__}"
-            )
         model = controller.problem.model
         self.controller = controller
         self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
         self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
         self.estimator = default_estimator(controller) if estimator is None else estimator
-        self.sensors = USUAL_CHECKS if sensors is None else sensors
+        self.sensors = as_instance("sensors", USUAL_CHECKS if sensors is None else sensors, SensorChecks)
         self._sensors = self.sensors.fitted(controller.problem, self.estimator.noise)
         self._v_shape = (model.n_disturbances,)
         tolerance = None
@@ -108,7 +102,8 @@ class Regulator:
             raise MampcError(f"estimator: expected a model with {expected}, received {received}")
         self.reference_filter, self._filter = reference_filter, None
         if reference_filter is not None:
-            self._filter = reference_filter.fitted(model.n_outputs, model.dt)
+            smooth = as_instance("reference_filter", reference_filter, ReferenceFilter)
+            self._filter = smooth.fitted(model.n_outputs, model.dt)
         self._samples = controller.problem.prediction_horizon + 1
         self.valves, self._compensation = valves, None
         if valves is not None:

@@ -19,6 +19,7 @@ An output has one fault at a time, the first in this order.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -27,44 +28,27 @@ import numpy as np
 from mampc.base.checks import LARGEST, Array, BoolArray, as_array, as_limit, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.base.words import Fault
-from mampc.loop.kalman_filter import static_response
 from mampc.program.problem import TrackingProblem
 
-
-@dataclass(frozen=True)
-class Thresholds:
-    """Every number in the tests that `SensorChecks` does not set.
-
-    Attributes:
-        jump_of_reach: default largest jump, as a share of the reach: what the inputs' whole range does to an output.
-        jump_of_noise: default largest jump at least, in standard deviations of the noise, where it is known.
-        reach_within: samples within which the inputs reach an output that washes out before its steady state.
-        absurd_of_reach: times the reach from the operating point no plant gets; nothing there is ever believed.
-        stuck_movement: predicted movement, as a share of the largest jump, that a working sensor shows.
-        quiet_movement: as a share of `stuck_movement`: with less of it equal numbers say nothing of a sensor.
-        longer_than_usual: times its longest run of equal numbers while healthy, then a sensor may be stuck.
-        longest_patience: times `stuck_after`: what this can come to at most.
-        coarse_step: as a share of the largest jump: a sensor with larger steps, and nothing between, is coarse.
-        coarse_patience: times `stuck_after`: how long the number of a coarse sensor may stay the same.
-        believed_again: times `stuck_after` samples without any output: then stuck sensors are believed again.
-        divides: what may be left of a change divided by a step, as a share of both, for rounding.
-    """
-
-    jump_of_reach: float = 0.1
-    jump_of_noise: float = 6.0
-    reach_within: int = 10
-    absurd_of_reach: float = 100.0
-    stuck_movement: float = 0.2
-    quiet_movement: float = 0.1
-    longer_than_usual: float = 3.0
-    longest_patience: float = 10.0
-    coarse_step: float = 1e-3
-    coarse_patience: float = 2.0
-    believed_again: float = 10.0
-    divides: float = 1e-3
-
-
-THRESHOLDS = Thresholds()
+# What `SensorChecks` does not set.
+JUMP_OF_REACH = (
+    0.1  # default largest jump, as a share of the reach: what the inputs' whole range does to an output
+)
+JUMP_OF_NOISE = 6.0  # and at least so many standard deviations of the noise, where it is known
+REACH_WITHIN = 10  # samples within which the inputs reach an output that washes out before its steady state
+ABSURD_OF_REACH = (
+    100.0  # times the reach from the operating point no plant gets; nothing there is ever believed
+)
+STUCK_MOVEMENT = 0.2  # predicted movement, as a share of the largest jump, that a working sensor shows
+QUIET_MOVEMENT = 0.1  # of that movement: with less of it equal numbers say nothing of a sensor
+LONGER_THAN_USUAL = 3.0  # times its longest run of equal numbers while healthy, then a sensor may be stuck
+LONGEST_PATIENCE = 10.0  # times `stuck_after`: what this can come to at most
+COARSE_STEP = (
+    1e-3  # as a share of the largest jump: a sensor with larger steps, and nothing between, is coarse
+)
+COARSE_PATIENCE = 2.0  # times `stuck_after`: how long the number of a coarse sensor may stay the same
+BELIEVED_AGAIN = 10.0  # times `stuck_after` samples without any output: then stuck sensors are believed again
+DIVIDES = 1e-3  # what may be left of a change divided by a step, as a share of both, for rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,26 +130,23 @@ class Sensors:
 
     def __init__(self, checks: SensorChecks, problem: TrackingProblem, noise: Array | None = None) -> None:
         l = problem.model.n_outputs
-        low, high = (
-            as_limit("y_low", checks.y_low, l, -np.inf),
-            as_limit("y_high", checks.y_high, l, np.inf),
-        )
+        low, high = as_limit("y_low", checks.y_low, l, -np.inf), as_limit("y_high", checks.y_high, l, np.inf)
         if (low >= high).any():
             raise MampcError(f"sensors: expected y_low < y_high, received {low} and {high}")
         largest = np.nextafter(LARGEST, 0.0)  # what is as large as `LARGEST` is missing, not in range
         self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
         reach = _reach(problem)
-        self._jump = THRESHOLDS.jump_of_reach * reach
+        self._jump = JUMP_OF_REACH * reach
         if noise is None and problem.model.noise is not None:
             noise = problem.model.noise.output
         if noise is not None:
-            self._jump = np.maximum(self._jump, THRESHOLDS.jump_of_noise * noise)
+            self._jump = np.maximum(self._jump, JUMP_OF_NOISE * noise)
         if checks.largest_jump is not None:
             self._jump = _largest_jump(checks.largest_jump, l)
-        self._absurd, self._y_op = THRESHOLDS.absurd_of_reach * reach, problem.model.y_op
-        self._stuck_movement = np.minimum(THRESHOLDS.stuck_movement * self._jump, LARGEST / 2)
-        self._quiet_movement = THRESHOLDS.quiet_movement * self._stuck_movement
-        self._coarse_step = THRESHOLDS.coarse_step * self._jump
+        self._absurd, self._y_op = ABSURD_OF_REACH * reach, problem.model.y_op
+        self._stuck_movement = np.minimum(STUCK_MOVEMENT * self._jump, LARGEST / 2)
+        self._quiet_movement = QUIET_MOVEMENT * self._stuck_movement
+        self._coarse_step = COARSE_STEP * self._jump
         self._coarse = self._coarse_step.tolist()
         self._bounds = np.stack([self._jump, self._low, self._high], axis=1).tolist()
         self._confirm = checks.confirm
@@ -200,7 +181,7 @@ class Sensors:
         repeats = np.where(came, np.where(changed, 0.0, state.repeats + 1), state.repeats)
         moved = np.where(changed, 0.0, state.moved + movement)
         stuck = came & ~changed & self._is_stuck(state, repeats, moved)
-        if state.blind >= THRESHOLDS.believed_again * self._stuck_after:
+        if state.blind >= BELIEVED_AGAIN * self._stuck_after:
             repeats[stuck], moved[stuck], stuck = 0.0, 0.0, self._none
         jumped = came & ~stuck & (np.abs(innovation) > self._jump)
         doubted = self._doubted(state, y, jumped)
@@ -249,9 +230,9 @@ class Sensors:
     def _is_stuck(self, state: SensorState, repeats: Array, moved: Array) -> BoolArray:
         """The outputs that have shown the same for too long, though the model moved them, shape (l,)."""
         coarse = state.step > self._coarse_step
-        least = np.where(coarse, THRESHOLDS.coarse_patience, 1.0) * self._stuck_after
-        longest = THRESHOLDS.longest_patience * self._stuck_after
-        long = repeats >= np.clip(THRESHOLDS.longer_than_usual * state.longest, least, longest)
+        least = np.where(coarse, COARSE_PATIENCE, 1.0) * self._stuck_after
+        longest = LONGEST_PATIENCE * self._stuck_after
+        long = repeats >= np.clip(LONGER_THAN_USUAL * state.longest, least, longest)
         moves = np.abs(moved) > np.where(coarse, self._jump, self._stuck_movement)
         stuck: BoolArray = (state.stuck != 0.0) | (long & moves)
         return stuck
@@ -283,7 +264,7 @@ class Sensors:
         change, known = np.where(changed, np.abs(y - state.y), 0.0), np.where(step > 0.0, step, 1.0)
         rest = np.fmod(change, known)
         rest = np.minimum(rest, known - rest)
-        finer: Array = np.where(rest > THRESHOLDS.divides * np.minimum(change, known), rest, step)
+        finer: Array = np.where(rest > DIVIDES * np.minimum(change, known), rest, step)
         return np.where(step > 0.0, finer, change)
 
 
@@ -299,8 +280,9 @@ def _largest_jump(told: Any, l: int) -> Array:
 def _reach(problem: TrackingProblem) -> Array:
     """How far the whole range of the inputs moves each output, in a steady state or soon, shape (l,)."""
     model, limits, m = problem.model, problem.limits, problem.model.n_inputs
-    soon = np.abs(model.step_response(THRESHOLDS.reach_within + 1)[:, :, :m]).max(axis=0)
-    gain = np.maximum(np.abs(static_response(model)[:, :m]), soon)  # an output may wash out
+    gain = np.abs(model.step_response(REACH_WITHIN + 1)[:, :, :m]).max(axis=0)  # an output may wash out
+    with suppress(MampcError):  # an integrator has no other
+        gain = np.maximum(gain, np.abs(model.dc_gain()[:, :m]))
     ranges = np.broadcast_to(limits.u_max - limits.u_min, gain.shape)
     reach: Array = (gain * np.where(gain > 0, ranges, 0.0)).sum(axis=1)
     return np.where(reach > 0, reach, np.inf)

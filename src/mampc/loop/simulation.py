@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_matrix, as_vector, as_whole
+from mampc.base.checks import Array, as_array, as_instance, as_matrix, as_vector, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.base.progress import watched
@@ -193,8 +193,7 @@ def acting_on(
     variant: str | Sequence[str] | None = None,
 ) -> Acting:
     """What the arguments of `simulate` say, checked."""
-    if not isinstance(regulator, Regulator):
-        raise MampcError(f"regulator: expected a mampc.Regulator, received {type(regulator).__name__}")
+    as_instance("regulator", regulator, Regulator)
     if not isinstance(getattr(plant, "names", None), Names):
         raise MampcError(f"plant: expected a plant or a mampc.StateSpace, received {shown(plant)}")
     model = regulator.controller.problem.model
@@ -230,8 +229,8 @@ def acting_on(
         "output": _trajectory("output_disturbance", _default(output_disturbance, 0.0), l, T),
         "measured": _trajectory("measured_disturbance", _default(measured_disturbance, usual), d, T),
     }
-    if not isinstance(valves, Valves | None):
-        raise MampcError(f"valves: expected mampc.Valves, received {type(valves).__name__}")
+    if valves is not None:
+        as_instance("valves", valves, Valves)
     start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
     return Acting(
         dt=model.dt, reference=rows[ahead], zone=zone, spread=spread, at=at,

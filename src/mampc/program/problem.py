@@ -7,9 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray, as_limit, as_number, as_vector, as_weight, as_whole
+from mampc.base.checks import (
+    Array,
+    BoolArray,
+    as_instance,
+    as_limit,
+    as_number,
+    as_vector,
+    as_weight,
+    as_whole,
+)
 from mampc.base.errors import MampcError, shown
-from mampc.systems.state_space import StateSpace
+from mampc.systems.state_space import StateSpace, as_discrete
 
 MOST_PREDICTIONS = 5000  # future values of all outputs together; their weights take the square of it
 MOST_MOVES = 1000  # future moves of all inputs together
@@ -137,10 +146,7 @@ class TrackingProblem:
     output_rank: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.model, StateSpace):
-            raise MampcError(f"model: expected a mampc.StateSpace, received {type(self.model).__name__}")
-        if not self.model.is_discrete:
-            raise MampcError("model: expected a discrete model, received dt = 0; use model.discretise(dt)")
+        as_discrete("model", self.model)
         n_p = as_whole("prediction_horizon", self.prediction_horizon, 1, LONGEST_HORIZON)
         n_c = as_whole("control_horizon", self.control_horizon, 1, LONGEST_HORIZON)
         if n_c > n_p:
@@ -149,8 +155,7 @@ class TrackingProblem:
             )
         m, l = self.model.n_inputs, self.model.n_outputs
         Q = as_weight("output_weight", self.output_weight, l)
-        if not isinstance(self.limits, Limits):
-            raise MampcError(f"limits: expected mampc.Limits, received {type(self.limits).__name__}")
+        limits = as_instance("limits", self.limits, Limits).checked(m, l)
         weight = as_number("output_limit_weight", self.output_limit_weight, 0.0, exclusive=True)
         if weight > LARGEST_LIMIT_WEIGHT:
             raise MampcError(
@@ -170,7 +175,7 @@ class TrackingProblem:
             "control_horizon": n_c,
             "output_weight": Q,
             "move_weight": as_weight("move_weight", self.move_weight, m),
-            "limits": self.limits.checked(m, l),
+            "limits": limits,
             "output_limit_weight": weight,
             "tail_horizon": as_number("tail_horizon", self.tail_horizon, 0.0),
             "u_target_weight": as_weight("u_target_weight", self.u_target_weight, m),

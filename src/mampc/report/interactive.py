@@ -18,7 +18,7 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.drawing import time_scale
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, listed
 from mampc.loop.drawing import near_limits
 from mampc.loop.metrics import Metrics
 from mampc.loop.run import Run
@@ -122,7 +122,7 @@ def interactive_page(result: StudyResult, means: Means | None = None) -> str:
     parts = {
         "title": f"{study.name}: fewer moves, and what they cost",
         "means": "" if means is None else f"{means.told} {means.note}".strip(),
-        "subtitle": f"{len(study.controllers)} {kind} on {_words(names.inputs)} and {_words(names.outputs)}, "
+        "subtitle": f"{len(study.controllers)} {kind} on {listed(names.inputs)} and {listed(names.outputs)}, "
         f"{study.steps} samples of {_duration(study.dt)}. The model has {result.model.n_states} states"
         + (f" and explains {fit} in the record it comes from." if fit else "."),
         "sentence": first["choices"][first["first"]]["sentence"],
@@ -364,7 +364,3 @@ def _duration(seconds: float) -> str:
         if seconds >= 2 * size:
             return f"{_number(seconds / size)}\u00a0{unit}"
     return f"{_number(seconds)}\u00a0s"
-
-
-def _words(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mampc.base.errors import listed
 from mampc.systems.properties import doubtful_gains, gain_deviation, properties, time_in_words
 from mampc.systems.state_space import StateSpace
 
@@ -94,5 +95,4 @@ def _unit(output: str | None, of_input: str | None, integrates: bool) -> str:
 
 
 def _named(names: tuple[str, ...], values: Any) -> str:
-    shown = [f"{name} {value:.3g}" for name, value in zip(names, values, strict=True)]
-    return ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "")
+    return listed([f"{name} {value:.3g}" for name, value in zip(names, values, strict=True)])

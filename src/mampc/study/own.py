@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, listed
 from mampc.controllers.offset import HIGHEST_PRICE, highest_price
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import MOST_PREDICTIONS, Limits, TrackingProblem
@@ -321,5 +321,4 @@ def _string(text: str) -> str:
 
 def _words(names: Sequence[str]) -> str:
     """Names as a comment can hold them."""
-    shown = [re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", " ", name)[:80] for name in names[:20]]
-    return ", ".join(shown) + (f" and {len(names) - 20} more" if len(names) > 20 else "")
+    return listed([re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", " ", name)[:80] for name in names], 20)

@@ -1,4 +1,4 @@
-"""Matrices out of the systems of other libraries."""
+"""Models out of the systems of other libraries."""
 
 from __future__ import annotations
 
@@ -8,12 +8,32 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
+from mampc.systems.state_space import StateSpace
 
 REDUNDANT = 1e-10  # of a matrix: directions that inputs or past states do not reach
 LEADING = 1e-14  # of a polynomial: leading coefficients that are rounding
 
 Polynomial: TypeAlias = Array
 Matrices: TypeAlias = tuple[Array, Array, Array, Array]
+
+
+def model_of(system: Any, dt: float | None) -> StateSpace:
+    """A model at the sample time wanted, if any; see `StateSpace.from_any`."""
+    if isinstance(system, StateSpace):
+        model = system
+    else:
+        A, B, C, D, own_dt = matrices_of(system)
+        stated = dt if own_dt is None else own_dt
+        if stated is None:
+            raise MampcError("from_any: expected a sample time, received a system that states none; pass dt=")
+        model = StateSpace(A, B, C, D, stated)
+    if dt is None or np.isclose(model.dt, dt, rtol=1e-9, atol=0.0):
+        return model
+    if model.is_discrete:
+        raise MampcError(
+            f"from_any: expected a sample time of {dt:g} s, received a system with {model.dt:g} s"
+        )
+    return model.discretise(dt)
 
 
 def matrices_of(system: Any) -> tuple[Any, Any, Any, Any, float | None]:

@@ -17,7 +17,7 @@ from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError
 from mampc.systems.modes import apart
 from mampc.systems.pairs import NEGLIGIBLE, SLOWEST_FREE, Pair, delayed, joined
-from mampc.systems.state_space import StateSpace
+from mampc.systems.state_space import StateSpace, as_discrete
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +55,7 @@ class Mismatch:
         Raises:
             MampcError: a continuous model.
         """
-        if not isinstance(model, StateSpace) or not model.is_discrete:
-            raise MampcError(f"Mismatch: expected a discrete model, received {model!r}")
+        as_discrete("Mismatch", model)
         rng = np.random.default_rng([as_whole("seed", seed, 0), 0x4D49])
         l, columns = model.D.shape
         shares = rng.uniform(-1.0, 1.0, (3, l, columns))

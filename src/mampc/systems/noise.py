@@ -37,3 +37,8 @@ class Noise:
                 raise MampcError(f"noise.{name}: expected numbers of at least zero, received {value}")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+
+
+def white_noise(noise: Noise | None) -> Array | None:
+    """Standard deviation of the white noise of each output, shape (l,), where a record showed it of all; else None."""
+    return noise.output if noise is not None and (noise.output > 0).all() else None

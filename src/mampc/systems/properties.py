@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray, ComplexArray
-from mampc.base.errors import MampcError
 from mampc.systems.modes import apart
-from mampc.systems.state_space import StateSpace
+from mampc.systems.state_space import StateSpace, as_discrete
 
 LASTS = 1e-9  # distance from the unit circle of modes that do not decay
 SEEN = 0.02  # of a channel's largest change: what ends its dead time, and what is left when it has settled
@@ -64,8 +63,7 @@ def properties(model: StateSpace) -> Properties:
     Raises:
         MampcError: a continuous model.
     """
-    if not model.is_discrete:
-        raise MampcError("properties: expected a discrete model, received dt = 0; discretise it first")
+    as_discrete("properties", model)
     lasting, settling = _apart(model)
     poles = np.linalg.eigvals(lasting.A) if lasting.n_states else np.zeros(0)
     unstable = int((np.abs(poles) > 1 + LASTS).sum())

@@ -16,8 +16,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mampc.base.checks import Array, ComplexArray, as_array, as_matrix, as_number, as_vector, as_whole
-from mampc.base.errors import MampcError
+from mampc.base.checks import (
+    Array,
+    ComplexArray,
+    as_array,
+    as_instance,
+    as_matrix,
+    as_number,
+    as_vector,
+    as_whole,
+)
+from mampc.base.errors import MampcError, listed
 from mampc.base.names import Names, require_count
 from mampc.systems.evidence import Evidence
 from mampc.systems.noise import Noise
@@ -91,13 +100,15 @@ class StateSpace:
 
     def __repr__(self) -> str:
         names = self.names
-        sizes = f"{self.n_states} states"
-        parts = [sizes, f"inputs {_listed(names.inputs)}", f"outputs {_listed(names.outputs)}"]
+        parts = [
+            f"{self.n_states} states",
+            f"inputs {_short(names.inputs)}",
+            f"outputs {_short(names.outputs)}",
+        ]
         if names.disturbances:
-            parts.append(f"measured disturbances {_listed(names.disturbances)}")
-        return (
-            f"StateSpace({', '.join(parts)}, {f'dt = {self.dt:g} s' if self.is_discrete else 'continuous'})"
-        )
+            parts.append(f"measured disturbances {_short(names.disturbances)}")
+        parts.append(f"dt = {self.dt:g} s" if self.is_discrete else "continuous")
+        return f"StateSpace({', '.join(parts)})"
 
     def __str__(self) -> str:
         """The model, and gain, time constant and dead time of its first channels."""
@@ -134,6 +145,11 @@ class StateSpace:
     def is_discrete(self) -> bool:
         return self.dt > 0
 
+    @property
+    def _shift(self) -> Array:
+        """What A is in a steady state of all modes: I, in continuous time 0."""
+        return np.eye(self.n_states) * self.is_discrete
+
     def poles(self) -> ComplexArray:
         """Eigenvalues of A, shape (n,)."""
         return np.linalg.eigvals(self.A).astype(complex)
@@ -149,8 +165,7 @@ class StateSpace:
         Raises:
             MampcError: the model integrates, so that no finite gain exists.
         """
-        shift = np.eye(self.n_states) if self.is_discrete else 0.0
-        singular = shift - self.A
+        singular = self._shift - self.A
         if self.n_states and np.linalg.cond(singular) > 1e13:
             raise MampcError(
                 "dc_gain: expected a model without integrators, received a pole at zero frequency"
@@ -173,8 +188,7 @@ class StateSpace:
         Raises:
             MampcError: a continuous model, or n below 1.
         """
-        if not self.is_discrete:
-            raise MampcError("step_response: expected a discrete model, received dt = 0; discretise it first")
+        as_discrete("step_response", self)
         increments = np.empty((as_whole("n", n, 1), *self.D.shape))
         increments[0], state = self.D, self.B
         with np.errstate(over="ignore", invalid="ignore"):
@@ -232,8 +246,7 @@ class StateSpace:
         if inputs.shape == self.u_op.shape:
             inputs = np.concatenate([inputs, self.v_op])
         change = as_vector("u", inputs, self.B.shape[1]) - self.all_inputs_op
-        shift = np.eye(self.n_states) if self.is_discrete else np.zeros((self.n_states, self.n_states))
-        x: Array = np.linalg.lstsq(shift - self.A, self.B @ change)[0]
+        x: Array = np.linalg.lstsq(self._shift - self.A, self.B @ change)[0]
         return x
 
     def response(self, u: Any, x0: Any = None) -> Array:
@@ -242,8 +255,7 @@ class StateSpace:
         Raises:
             MampcError: a continuous model, or inputs of another width.
         """
-        if not self.is_discrete:
-            raise MampcError("response: expected a discrete model, received dt = 0; discretise it first")
+        as_discrete("response", self)
         du = as_matrix("u", u, None, self.B.shape[1]) - self.all_inputs_op
         x = np.zeros(self.n_states) if x0 is None else as_vector("x0", x0, self.n_states)
         drive, states = du @ self.B.T, np.empty((len(du), self.n_states))
@@ -353,26 +365,9 @@ class StateSpace:
         Raises:
             MampcError: an unknown kind of object, an unstated sample time and no dt, or a dt that differs.
         """
-        if isinstance(system, StateSpace):
-            model = system
-        else:
-            from mampc.systems.conversion import matrices_of
+        from mampc.systems.conversion import model_of
 
-            A, B, C, D, own_dt = matrices_of(system)
-            if own_dt is None and dt is None:
-                raise MampcError(
-                    "from_any: expected a sample time, received a system that states none; pass dt="
-                )
-            model = cls(A, B, C, D, dt if own_dt is None else own_dt)  # type: ignore[arg-type]
-        if dt is None or model.dt == dt:
-            return model
-        if not model.is_discrete:
-            return model.discretise(dt)
-        if np.isclose(model.dt, dt, rtol=1e-9):
-            return model
-        raise MampcError(
-            f"from_any: expected a sample time of {dt:g} s, received a system with {model.dt:g} s"
-        )
+        return model_of(system, dt)
 
     def save(self, path: str | Path) -> None:
         """Write the model as JSON, whole or not at all; `load` gives the same numbers back.
@@ -392,7 +387,14 @@ class StateSpace:
         return read(path)
 
 
-def _listed(names: tuple[str, ...]) -> str:
+def as_discrete(name: str, value: Any) -> StateSpace:
+    """A model in discrete time; raises `MampcError` for anything else, the message beginning with the name."""
+    model = as_instance(name, value, StateSpace)
+    if not model.is_discrete:
+        raise MampcError(f"{name}: expected a discrete model, received dt = 0; discretise it first")
+    return model
+
+
+def _short(names: tuple[str, ...]) -> str:
     """The names, those after the fourth only counted."""
-    shown = [name if len(name) <= 20 else f"{name[:19]}…" for name in names[:4]]
-    return " ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return listed([name if len(name) <= 20 else f"{name[:19]}…" for name in names], 4, " ")
