@@ -144,6 +144,11 @@ def test_a_column_without_numbers_is_refused(tmp_path):
         (("time", "u", "Quality", "y", "Quality"), "good", "Uncertain"),
         (("time", "u", "Status", "y", "Status.1"), "OK", ""),
         (("time", "u", "u quality", "y", "y quality"), "", "Questionable"),
+        (("time", "u", "q", "y", "q"), "Good", "Bad"),
+        (("time", "u", "remark", "y", "remark"), "Good", "Bad [No Data]"),
+        (("time", "u", "u.Good", "y", "y.Good"), "True", "False"),
+        (("time", "u", "Bad_u", "y", "Bad_y"), "0", "1"),
+        (("time", "u", "Questionable", "y", "Questionable"), "False", "True"),
     ],
 )
 def test_values_of_bad_quality_are_not_used(tmp_path, header, good, bad):
@@ -151,6 +156,29 @@ def test_values_of_bad_quality_are_not_used(tmp_path, header, good, bad):
     export = read(tmp_path, text(lines, header=header))
     assert [len(record) for record in export.records] == [5, 6]
     assert told(export, "taken as the quality of y")
+
+
+def test_a_quality_that_stands_before_its_value_speaks_of_that(tmp_path):
+    lines = [[time, "Good", u, "Bad" if k == 5 else "Good", y] for k, (time, u, y) in enumerate(rows())]
+    export = read(tmp_path, text(lines, header=("time", "Quality", "u", "Quality", "y")))
+    assert told(export, "y: no number in 1 of 12 rows: quality 'bad'")
+    assert not told(export, "u: no number")
+
+
+def test_value_and_quality_of_one_item_belong_together(tmp_path):
+    lines = [
+        [time, u, "GOOD", "0" if k == 5 else y, "BAD" if k == 5 else "GOOD"]
+        for k, (time, u, y) in enumerate(rows())
+    ]
+    header = ("time", "F1.MV.Value", "F1.MV.Quality", "T1.PV.Value", "T1.PV.Quality")
+    export = read(tmp_path, text(lines, header=header), inputs="F1.MV.Value", outputs="T1.PV.Value")
+    assert [len(record) for record in export.records] == [5, 6]
+
+
+def test_a_number_named_good_is_no_good_byte_of_opc(tmp_path):
+    lines = [[time, u, "0", y, "0" if k == 5 else "192"] for k, (time, u, y) in enumerate(rows())]
+    export = read(tmp_path, text(lines, header=("time", "u", "u.Status", "y", "y.OPCQuality")), good="0")
+    assert [len(record) for record in export.records] == [5, 6]
 
 
 def test_a_quality_that_says_nothing_known_is_asked_about(tmp_path):

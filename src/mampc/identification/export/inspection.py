@@ -107,7 +107,7 @@ def inspect_export(
         dt = as_number("dt", dt, 0.0, exclusive=True)
     sheet = open_table(source, wanted, how, findings)
     taken = [at for name in wanted if (at := find_column(sheet.header, name)) is not None]
-    qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet.header, at)]
+    qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet, at)]
     clock = read_clock(sheet, [*taken, *qualities], how, findings)
     free = [
         at

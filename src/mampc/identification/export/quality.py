@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -12,51 +12,85 @@ from mampc.base.checks import BoolArray
 from mampc.base.errors import shown
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import UNIT
-from mampc.identification.export.numbers import Column
+from mampc.identification.export.numbers import Column, says_numbers
 from mampc.identification.export.sheet import Cells, Sheet
 
-WORDS = ("quality", "qual", "opcquality", "status", "validity", "qualität", "qualitaet", "qualité", "calidad")
-BEHIND_A_NAME = (*WORDS, "q", "qc", "st", "state", "flag", "good", "valid")
+WORDS = ("quality", "qual", "opcquality", "status", "statuscode", "qualitycode", "validity", "confidence")
+WORDS += ("qualität", "qualitaet", "qualité", "calidad")
+TRUTHS = ("good", "isgood", "valid", "isvalid")  # alone only where true or false stands under them
+DENIALS = ("bad", "isbad", "questionable", "substituted")  # what is true under them is not good
+BEHIND_A_NAME = (*WORDS, *TRUTHS, *DENIALS, "q", "qc", "st", "state", "flag", "conf")
+DENIAL = re.compile(rf"^({'|'.join(DENIALS)})([\W_]|$)|[\W_]({'|'.join(DENIALS)})[\W_\d]*$")
+VALUE = re.compile(r"[\W_]+(value|val|wert|valeur|valor)$")
+TRUE_OR_FALSE = frozenset({"true", "false", "0", "1", "yes", "no", ""})
 GOOD = frozenset({"good", "g", "ok", "valid", "normal", "raw", "gut", "bon", "true", "yes"})
 # Behind "good", such as "Good, Annotated" or "Good [Non-Specific]", what does not take it back.
 STILL_GOOD = re.compile(
     r"(\d+ )?(good|gut|bon|ok)\b(?!.*\b(not|bad|questionable|uncertain|suspect|stale|substituted)\b).*"
 )
+SPOKEN = re.compile(r"(good|bad|uncertain|questionable)\b.*")  # cells that nothing but a quality holds
 OPC_GOOD = range(192, 256)  # the quality byte of OPC DA: its two highest bits are set
+OPC_BAD = range(64)  # none of them is
 
 
-def quality_columns(header: Sequence[str], columns: Mapping[str, int]) -> dict[int, tuple[str, ...]]:
+def quality_columns(sheet: Sheet, columns: Mapping[str, int]) -> dict[int, tuple[str, ...]]:
     """Which columns, by position, speak of which of the wanted ones, by name.
 
-    "TI101.Quality" speaks of "TI101", "Quality" of the column on its left, or of all where it stands
-    only once.
+    "TI101.Quality" speaks of "TI101" and of "TI101.Value". "Quality", or any other name over words such as Good
+    and Bad, speaks of all columns where it stands only once, else of its neighbour: the one on its left, but
+    where the first one has no values there, the one on its right.
     """
-    taken = set(columns.values())
-    general = [at for at, word in enumerate(header) if at not in taken and _plain(word) in WORDS]
-    found: dict[int, tuple[str, ...]] = {
-        at: (name,)
-        for at, word in enumerate(header)
-        if at not in taken and at not in general
-        for name, position in columns.items()
-        if _speaks_of(word, header[position])
-    }
-    if len(general) == 1:
-        found[general[0]] = tuple(columns)
-    elif general:
-        left = {position: name for name, position in columns.items()}
-        found |= {at: (left[at - 1],) for at in general if at - 1 in left}
+    header, taken = sheet.header, set(columns.values())
+    free = [at for at in range(len(header)) if at not in taken]
+    found: dict[int, tuple[str, ...]] = {}
+    general: dict[str, list[int]] = {}
+    for at in free:
+        names = tuple(name for name, place in columns.items() if _speaks_of(header[at], header[place]))
+        if names:
+            found[at] = names
+        elif _is_general(sheet, at) and not _speaks_of_any(header, at):
+            general.setdefault(_plain(header[at]), []).append(at)
+    at_position = {position: name for name, position in columns.items()}
+    for places in general.values():
+        side = 1 if places[0] == 0 or not _holds_values(sheet, places[0] - 1) else -1
+        for at in places:
+            if len(places) == 1:
+                found[at] = tuple(columns)
+            elif at + side in at_position:
+                found[at] = (at_position[at + side],)
     return found
 
 
-def is_quality(header: Sequence[str], at: int) -> bool:
-    """Whether a column speaks of others, by its name."""
-    return _plain(header[at]) in WORDS or any(_speaks_of(header[at], name) for name in header)
+def is_quality(sheet: Sheet, at: int) -> bool:
+    """Whether a column speaks of others, by its name or its first cells."""
+    return _is_general(sheet, at) or _speaks_of_any(sheet.header, at)
+
+
+def _is_general(sheet: Sheet, at: int) -> bool:
+    word, cells = _plain(sheet.header[at]), [row[at].strip().casefold() for row in sheet.sample]
+    if word in WORDS:
+        return True
+    if word in (*TRUTHS, *DENIALS):
+        return TRUE_OR_FALSE.issuperset(cells)
+    filled = [cell for cell in cells if cell]
+    return bool(filled) and all(SPOKEN.fullmatch(cell) for cell in filled)
+
+
+def _holds_values(sheet: Sheet, at: int) -> bool:
+    return says_numbers([row[at] for row in sheet.sample])
+
+
+def _speaks_of_any(header: Sequence[str], at: int) -> bool:
+    return any(_speaks_of(header[at], name) for k, name in enumerate(header) if k != at)
 
 
 def _speaks_of(word: str, name: str) -> bool:
-    bare = UNIT.sub("", name).casefold()
-    rest = word.casefold().removeprefix(bare)
-    return rest != word.casefold() and re.match(r"[\W_]", rest) is not None and _plain(rest) in BEHIND_A_NAME
+    bare, word = UNIT.sub("", name).casefold(), word.casefold()
+    for stem in {bare, VALUE.sub("", bare)} - {""}:
+        for rest in (word.removeprefix(stem), word.removesuffix(stem)):
+            if rest != word and re.search(r"^[\W_]|[\W_]$", rest) and _plain(rest) in BEHIND_A_NAME:
+                return True
+    return False
 
 
 def drop_bad_quality(
@@ -76,10 +110,13 @@ def drop_bad_quality(
         findings: receives a doubt where no word is known.
     """
     by_name = {column.name: column for column in columns}
-    speaking = quality_columns(sheet.header, positions)
+    speaking = quality_columns(sheet, positions)
     for at, names in speaking.items():
         words = _words(sheet.column(at))
-        is_good = _good(words, [str(word).strip().casefold() for word in good])
+        denies = DENIAL.search(sheet.header[at].casefold()) is not None
+        is_good = (
+            _not_true(words) if denies else _good(words, [str(word).strip().casefold() for word in good])
+        )
         if is_good is None:
             kinds = ", ".join(f"{shown(word)} ({count})" for word, count in Counter(words).most_common(5))
             findings.doubt(
@@ -96,13 +133,17 @@ def drop_bad_quality(
     return tuple(speaking)
 
 
-def _good(words: Sequence[str], named: Sequence[str]) -> BoolArray | None:
+def _good(words: Sequence[str], named: Collection[str]) -> BoolArray | None:
     """Which words mean a good value; None if that cannot be told."""
     kinds = set(words)
     numbers = {word: int(float(word)) for word in kinds if re.fullmatch(r"\d+(\.0+)?", word)}
+    named = {word for word in named if word in kinds}
+    of_opc = {word for word, number in numbers.items() if number in OPC_GOOD}
+    if of_opc:  # a number named for another column is no good byte of this one
+        named = {word for word in named if numbers.get(word) not in OPC_BAD}
     good = {word for word in kinds if word in GOOD or word in named or STILL_GOOD.fullmatch(word)}
     if not named:
-        good |= {word for word, number in numbers.items() if number in OPC_GOOD}
+        good |= of_opc
     if not good and len(kinds) == 1 and (kinds == {""} or set(numbers.values()) == {0}):
         good = kinds  # one word for all says nothing
     if not good and "" in kinds and not numbers:
@@ -110,6 +151,13 @@ def _good(words: Sequence[str], named: Sequence[str]) -> BoolArray | None:
     if not good:
         return None
     return np.array([word in good for word in words])
+
+
+def _not_true(words: Sequence[str]) -> BoolArray | None:
+    """Where it is denied that the value is bad."""
+    if not TRUE_OR_FALSE.issuperset(words):
+        return None
+    return np.array([word in ("false", "0", "no", "") for word in words])
 
 
 def _plain(word: str) -> str:

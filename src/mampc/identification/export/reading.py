@@ -143,7 +143,7 @@ def _read_table(
     sheet = open_table(source, wanted, how, findings)
     positions = {name: _position(sheet.header, name) for name in wanted}
     units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
-    quality = tuple(quality_columns(sheet.header, positions))
+    quality = tuple(quality_columns(sheet, positions))
     clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
     columns, values = read_numbers(sheet, positions, reading, findings, (*names.inputs, *names.disturbances))
     units = {column.name: column.unit for column in columns if column.unit} | units

@@ -71,7 +71,7 @@ def _tall(source: Any, names: Sequence[str], how: TimeReading, findings: Finding
     if tags is None:
         return None
     others = [at for at in range(len(sheet.header)) if at != tags]
-    quality = [at for at in others if is_quality(sheet.header, at)]
+    quality = [at for at in others if is_quality(sheet, at)]
     value = _named(sheet.header, VALUES)
     times = time_columns(
         sheet, [tags, *quality, *([] if value is None else [value])], how, Findings(findings.origin)
