@@ -15,8 +15,10 @@ from mampc.identification.export.header import UNIT
 from mampc.identification.export.numbers import Column, says_numbers
 from mampc.identification.export.sheet import Cells, Sheet
 
-WORDS = ("quality", "qual", "opcquality", "status", "statuscode", "qualitycode", "validity", "confidence")
-WORDS += ("qualität", "qualitaet", "qualité", "calidad")
+WORDS = (
+    "quality", "qual", "opcquality", "status", "statuscode", "qualitycode", "validity", "confidence",
+    "qualität", "qualitaet", "qualité", "calidad",
+)  # fmt: skip
 TRUTHS = ("good", "isgood", "valid", "isvalid")  # alone only where true or false stands under them
 DENIALS = ("bad", "isbad", "questionable", "substituted")  # what is true under them is not good
 BEHIND_A_NAME = (*WORDS, *TRUTHS, *DENIALS, "q", "qc", "st", "state", "flag", "conf")
