@@ -213,3 +213,26 @@ def test_a_printed_page_fits_its_paper_and_the_window_after_it(opened):
         plot = browser.find_element("css selector", "#signals .main-svg").rect["width"]
         assert plot == 680 if media else plot <= width
         assert browser.find_element("id", "slider").is_displayed() == (media == "")
+
+
+def test_the_page_draws_zones_that_move_as_bands_within_what_a_panel_shows():
+    told = "zones = [{ at = 15, below = 0.1, above = [inf, 0.4] }]\n\n[[scenarios]]"
+    text = SHORT.replace("# zone_below", "zone_below").replace("# zone_above", "zone_above")
+    text = text.replace("[[scenarios]]", told, 1)
+    study = parse_study(text[: text.index("[[scenarios]]")] + text[text.rindex("[[scenarios]]") :])
+    study = study.model_copy(update={"controllers": study.controllers[:1]})
+    result = run_study(study)
+    page = interactive.interactive_page(result)
+    (scenario,) = content(page)["scenarios"]
+    zone = result.runs["noisy"]["MPC"].zone
+    assert scenario["reference"] == [None] * 4
+    assert scenario["zones"][2:] == [None, None]
+    for i, (low, high) in enumerate(scenario["zones"][:2]):
+        bottom, top = scenario["panels"][i]["range"]
+        np.testing.assert_allclose(low, zone.low[:, i], atol=2e-3)
+        shown = np.isfinite(zone.high[:, i])
+        np.testing.assert_allclose(np.array(high)[shown], zone.high[shown, i], atol=2e-3)
+        assert (np.array(high)[~shown] > top).all()
+        assert max(high) <= top + (top - bottom)
+    assert "Grey bands are zones" in page
+    assert "<th>time outside</th>" in page

@@ -7,6 +7,8 @@ import pytest
 
 import mampc
 from builders import random_model
+from mampc.compare.candidates import candidates
+from mampc.compare.scenarios import Scenarios, Surroundings
 from mampc.report.summary import summarise
 from mampc.report.tables import comparison_tables
 from mampc.study import parse_study, run_study, template
@@ -140,6 +142,32 @@ def test_errors_count_from_the_zone():
     )
     assert point.zone is None
     assert point.metrics().tracking_error == pytest.approx(((point.y - point.r) ** 2).sum(axis=1).mean())
+
+
+def test_time_outside_is_of_the_samples_that_have_a_zone():
+    model = random_model(3)
+    zone = moving_zone(model)
+    low, high = zone.low.copy(), zone.high.copy()
+    low[20:] = high[20:] = model.y_op
+    run = mampc.simulate(model, regulator(model), mampc.Zone(low, high), noise=0.05)
+    off = (run.y < low) | (run.y > high)
+    assert run.metrics().time_outside[0] == pytest.approx(off[:20, 0].mean())
+    assert run.metrics(skip=10).time_outside[0] == pytest.approx(off[10:20, 0].mean())
+    assert np.isnan(run.metrics(skip=20).time_outside[0])
+
+
+def test_scenarios_of_tuning_count_from_the_zone():
+    model = random_model(3)
+    plain = regulator(model, rules=None)
+    around = Surroundings.of(plain.controller.problem, 0.05, None, ())
+    scenarios = Scenarios.drawn(plain, around, 2, (0, 1))
+    _, error = scenarios.run(plain)
+    batch = mampc.simulate_batch(
+        scenarios.plants, plain, scenarios.reference, seeds=scenarios.seeds, noise=scenarios.noise,
+        u_initial=scenarios.u_initial, progress=False,
+    )  # fmt: skip
+    np.testing.assert_allclose(error, batch.metrics().tracking_error)
+    assert candidates(plain.controller.problem, np.full(2, 0.05))
 
 
 def test_a_bank_counts_from_the_zone_of_the_variant_that_decides():

@@ -39,11 +39,16 @@ class Candidate:
     estimator: LoadBank
     guessed: bool = False
 
+    @property
+    def counts(self) -> bool:
+        """Whether plans count on later data, which zones forbid."""
+        return not self.problem.zoned.any()
+
     def regulator(self, price: float) -> Regulator:
         """It, with a price."""
         controller = MAMPC(self.problem, MoveRules(price=price))
         return Regulator(
-            controller, self.estimator, value_of_information=True, price_follows_noise=self.guessed
+            controller, self.estimator, value_of_information=self.counts, price_follows_noise=self.guessed
         )
 
     def points(self, prices: Sequence[float], scenarios: Scenarios) -> list[Point]:

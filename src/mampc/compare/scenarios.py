@@ -250,7 +250,10 @@ class Scenarios:
         )
 
     def run(self, regulator: Regulator) -> tuple[Array, Array]:
-        """Moves of all inputs together and tracking error, mean of (y - r)' Q (y - r), of each loop, shapes (S,)."""
+        """Moves of all inputs together and tracking error, mean of e' Q e, of each loop, shapes (S,).
+
+        e is y - r, of an output with a zone how far it is from that.
+        """
         (answer,) = self.run_each([regulator])
         return answer
 
@@ -270,6 +273,9 @@ class Scenarios:
         moves = (changes > batch.resolution[:, None]).sum(axis=(1, 2)).astype(float)
         with np.errstate(over="ignore", invalid="ignore"):
             off = batch.y - batch.r
+            if zones := [zone for zone in batch.zone if zone is not None]:  # all of one problem
+                low, high = (np.stack([getattr(zone, end) for zone in zones]) for end in ("low", "high"))
+                off = np.maximum(low - batch.y, 0.0) + np.maximum(batch.y - high, 0.0)
             error = np.einsum("sti,ij,stj->s", off, self.weight, off) / off.shape[1]
         error = np.where(np.isfinite(error), error, np.inf)
         return list(zip(moves.reshape(count, -1), error.reshape(count, -1), strict=True))

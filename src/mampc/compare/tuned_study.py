@@ -86,7 +86,7 @@ def with_tuning(study: Study, tuned: Tuned) -> Study:
         return study.model_copy(update=changed | {"controllers": [BASELINE]})
     estimator = EstimatorTable(
         kind="load_bank",
-        value_of_information=True,
+        value_of_information=not tuned.problem.zoned.any(),
         price_follows_noise=tuned.noise_guessed,
         measurement_noise=tuned.noise.tolist(),
     )

@@ -116,7 +116,7 @@ class Tuned:
         variants = {
             name: MAMPC(self.problem, replace(self.rules, price=price)) for name, price in prices.items()
         }
-        counts = isinstance(self.estimator, LoadBank)
+        counts = isinstance(self.estimator, LoadBank) and not self.problem.zoned.any()
         return Regulator(
             ControllerBank(variants), self.estimator, value_of_information=counts,
             price_follows_noise=counts and self.noise_guessed,
@@ -154,8 +154,8 @@ def tune(
     Args:
         model: a discrete model.
         limits: of inputs and outputs; those of `baseline` where that is given.
-        max_error_increase: 0.25 for a quarter more than plain MPC's mean of (y - r)' Q (y - r); the default, 0.25,
-            unless moves per hour are given.
+        max_error_increase: 0.25 for a quarter more than plain MPC's mean of e' Q e, e being y - r or how far y is
+            from its zone; the default, 0.25, unless moves per hour are given.
         max_moves_per_hour: of all inputs together, in place of it; the error is then as small as they allow.
         output_weight: Q; see `TrackingProblem`.
         noise: standard deviation of the measurement noise, scalar or (l,); default `model.noise`, else a 500th of

@@ -116,7 +116,7 @@ def signals_figure(
             if output and first.zone is not None and (first.zone.high > first.zone.low)[:, i].any():
                 panel.fill_between(
                     first.t / scale, *_within(panel, first.zone.low[:, i], first.zone.high[:, i]), step="post",
-                    color=GREY, alpha=0.2, linewidth=0, zorder=1.0, label="zone",
+                    facecolor=(GREY, 0.2), edgecolor=(GREY, 0.5), linewidth=0.7, zorder=1.0, label="zone",
                 )  # fmt: skip
             elif output:
                 panel.step(

@@ -27,7 +27,8 @@ class Metrics:
         exact_density: share of samples at which it changes at all.
         tracking_error: mean over samples of |y - r|^2 (eq. 11), in squared output units; of outputs with a zone the
             distance to it counts, which is nothing inside.
-        time_outside: share of samples at which an output is outside its zone, shape (l,); not-a-number without one.
+        time_outside: share of the samples at which an output has a zone that it is outside, shape (l,); not-a-number
+            without one.
         mean_distance_outside: of an output from its zone at these samples, in output units, shape (l,); 0 where there
             are none, not-a-number without a zone.
         moves: number of changes per input.
@@ -103,8 +104,10 @@ def compute(
     size = np.abs(changes)
     low, high = (r, r) if zone is None else (zone.low, zone.high)
     off = np.maximum(np.maximum(low - y, y - high), 0.0)[skip:]
-    outside, has_zone = off > 0, (high > low).any(axis=0)
-    mean_distance = off.sum(axis=0) / np.maximum(outside.sum(axis=0), 1)
+    in_zone = (high > low)[skip:]
+    outside, has_zone = (off > 0) & in_zone, in_zone.any(axis=0)
+    times = outside.sum(axis=0)
+    mean_distance = np.where(outside, off, 0.0).sum(axis=0) / np.maximum(times, 1)
     steps, smallest = len(size), as_vector("resolution", resolution, u.shape[1])
     moved = size > smallest
     moves = moved.sum(axis=0)
@@ -118,7 +121,7 @@ def compute(
         sparse_density=(size > threshold).sum(axis=0) / steps,
         exact_density=moves / steps,
         tracking_error=float(np.mean(np.sum(off**2, axis=1))),
-        time_outside=np.where(has_zone, outside.mean(axis=0), np.nan),
+        time_outside=np.where(has_zone, times / np.maximum(in_zone.sum(axis=0), 1), np.nan),
         mean_distance_outside=np.where(has_zone, mean_distance, np.nan),
         moves=moves,
         travel=np.where(moved, size, 0.0).sum(axis=0),

@@ -117,6 +117,8 @@ def interactive_page(result: StudyResult, means: Means | None = None) -> str:
     shown = "Outputs are the true ones, without measurement noise."
     if any(panel["limits"] for scenario in content["scenarios"] for panel in scenario["panels"]):
         shown += " Dotted lines are limits."
+    if any(zone for scenario in content["scenarios"] for zone in scenario["zones"]):
+        shown += " Grey bands are zones, within which an output costs nothing."
     if step > 1:
         shown += f" Of every {step} samples the smallest and the largest value are shown."
     parts = {
@@ -161,7 +163,7 @@ def _content(result: StudyResult, means: Means | None) -> tuple[dict[str, Any], 
     first = next(iter(next(iter(result.runs.values())).values()))
     scale, unit = time_scale(first.t)
     signals = len(first.names.outputs + first.names.inputs)
-    lines = sum(signals * len(runs) + len(first.names.outputs) for runs in result.runs.values())
+    lines = sum(signals * len(runs) + 2 * len(first.names.outputs) for runs in result.runs.values())
     step = -(-len(first.t) // max(MOST_NUMBERS // lines // 2, 1))
     step = 1 if step <= 2 else step
     favourite = [*result_looks(result), ""][1] if means is None else ""
@@ -199,26 +201,26 @@ def _scenario(
     base = baseline(study).name
     first = runs[base]
     names = first.names
-    panels, reference = [], []
+    panels, reference, zones = [], [], []
     for output, group in ((True, names.outputs), (False, names.inputs)):
         for i, signal in enumerate(group):
             data = [run.y[:, i] if output else run.u[:, i] for run in runs.values()]
-            asked = first.r[:, i] if output and np.isfinite(first.r[:, i]).all() else None
+            zone = _ends(first, i) if output else None
+            asked = first.r[:, i] if output and zone is None else None
             data += [] if asked is None else [asked]
             low, high = min(float(d.min()) for d in data), max(float(d.max()) for d in data)
             margin = 0.06 * (high - low) or 0.01 * abs(high) or 1.0
             limits, told = near_limits(study.problem.limits, output, i, low - margin, high + margin)
-            ends = [
-                low - margin,
-                high + margin,
-                *(limit - margin for limit in limits),
-                *(m + margin for m in limits),
-            ]
+            # Ends of a zone that are far away would flatten the data.
+            near = [] if zone is None else zone[np.abs(zone - (low + high) / 2) <= high - low + 2 * margin]
+            ends = [value + side for value in (low, high, *limits, *near) for side in (-margin, margin)]
             panels.append({
                 "title": names.with_unit(signal) + told, "staircase": not output, "limits": limits,
                 "range": [min(ends), max(ends)],
             })  # fmt: skip
             reference.append(None if asked is None else _thinned(asked, step))
+            cut = None if zone is None else np.clip(zone, min(ends) - margin, max(ends) + margin)
+            zones.append(None if cut is None else [_thinned(end, step) for end in cut])
     choices = []
     for controller in order:
         x, y = points[controller]
@@ -237,8 +239,17 @@ def _scenario(
     return {
         "name": name, "base": order.index(base),
         "first": order.index(favourite) if favourite in order else order.index(base),
-        "time": [float(f"{t:.8g}") for t in kept], "reference": reference, "panels": panels, "choices": choices,
+        "time": [float(f"{t:.8g}") for t in kept], "reference": reference, "zones": zones, "panels": panels,
+        "choices": choices,
     }  # fmt: skip
+
+
+def _ends(run: Run, i: int) -> Array | None:
+    """The ends of an output's zone, shape (2, T); None where it has a set point."""
+    zone = run.zone
+    if zone is None or not (zone.high[:, i] > zone.low[:, i]).any():
+        return None
+    return np.array([zone.low[:, i], zone.high[:, i]])
 
 
 def _thinned(values: Array, step: int) -> list[float]:
@@ -286,7 +297,11 @@ def _wear(run: Run, metrics: Metrics, dt: float) -> Iterator[list[str]]:
 def _tables(result: StudyResult, content: dict[str, Any]) -> str:
     """A table a scenario: every controller, in the order of the slider."""
     base = baseline(result.study).name
-    header = ("controller", "moves a day", "tracking error", f"error / {base}", "step, median", "proven best")
+    zones = has_zones(result.study)
+    header = (
+        "controller", "moves a day", "distance² outside" if zones else "tracking error", f"error / {base}",
+        *(("time outside",) if zones else ()), "step, median", "proven best",
+    )  # fmt: skip
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
     tables = []
     for number, (scenario, runs) in enumerate(result.runs.items()):
@@ -297,7 +312,7 @@ def _tables(result: StudyResult, content: dict[str, Any]) -> str:
             run = runs[choice["name"]]
             cells = (
                 choice["name"], _number(choice["x"]), _number(choice["y"], 3),
-                f"{choice['y'] / error[base]:.2f}" if error[base] > 0 else "-",
+                f"{choice['y'] / error[base]:.2f}" if error[base] > 0 else "-", *((_outside(run),) if zones else ()),
                 f"{np.median(run.solve_times) * 1e6:.0f} µs", f"{100 * (run.gaps == 0).mean():.0f} %",
             )  # fmt: skip
             rows.append(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>")
@@ -305,6 +320,12 @@ def _tables(result: StudyResult, content: dict[str, Any]) -> str:
         table = f"<table data-scenario='{number}'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
         tables.append(f"<div class='wide'>{caption}{table}</div>")
     return "\n".join(tables)
+
+
+def _outside(run: Run) -> str:
+    """Shares of time outside its zone, one an output, a dash for set points."""
+    shares = run.metrics().time_outside.tolist()
+    return " ".join("-" if share != share else f"{100 * share:.0f} %" for share in shares)
 
 
 def _statuses(result: StudyResult) -> str:

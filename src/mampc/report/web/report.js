@@ -85,7 +85,7 @@ function drawTradeoff() {
 }
 
 function drawSignals() {
-  const { time, reference, panels, choices, base } = content.scenarios[scenario];
+  const { time, reference, zones, panels, choices, base } = content.scenarios[scenario];
   const own = choices[choice], other = choices[base];
   const narrow = signals.clientWidth < 600;
   const height = narrow ? 150 : 170, total = 100 + height * panels.length;
@@ -119,6 +119,17 @@ function drawSignals() {
       layout.shapes.push({
         type: "line", xref: "paper", x0: 0, x1: 1, yref: axis, y0: limit, y1: limit, line: { color: BLACK, width: 1, dash: "dot" },
       });
+    }
+    if (zones[i]) {
+      const [low, high] = zones[i];
+      for (const [values, fill] of [[low, "none"], [high, "tonexty"]]) {
+        traces.push({
+          x: time, y: values, name: "zone", legendgroup: "zone", showlegend: fill !== "none" && !seen.has("zone"), yaxis: axis,
+          mode: "lines", line: { color: "rgba(92,92,92,0.5)", width: 0.8, shape: "hv" }, fill, fillcolor: "rgba(92,92,92,0.18)",
+          hoverinfo: "skip",
+        });
+      }
+      seen.add("zone");
     }
     draw(reference[i], "reference", BLACK, true, "dash", axis, 1);
     draw(other.signals[i], other.name, GREY, panel.staircase, "solid", axis, 1.5);
