@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -16,6 +17,15 @@ class MampcWarning(UserWarning):
 
 class StudyError(MampcError):
     """A study file with a wrong key, type, value or unit; the message names each place."""
+
+
+@contextmanager
+def said_at(place: str, kind: type[ValueError] = StudyError) -> Iterator[None]:
+    """What is refused inside is a mistake in a study: the message begins with its place."""
+    try:
+        yield
+    except MampcError as error:
+        raise kind(f"{place}{error}") from None
 
 
 def shown(value: Any, length: int = 60) -> str:

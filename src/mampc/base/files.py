@@ -40,6 +40,15 @@ def read_text(path: str | Path, limit: int, kind: str) -> str:
         raise MampcError(f"{path}: expected a readable {kind}, received: {error}") from None
 
 
+def made_folder(path: Path) -> Path:
+    """The folder for results, made where it is not there; `MampcError` where it cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MampcError(f"--out: expected a folder that can be written, received: {error}") from None
+    return path
+
+
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
     """A path to write to beside `path`, renamed to it on success and removed on failure.

@@ -110,6 +110,7 @@ def _swept(
     from mampc.compare.sweep import Sweep, run_sweep, run_task
     from mampc.study import load_study
     from mampc.study.running import prepare
+    from mampc.systems.properties import time_in_words
 
     plan = Sweep(load_study(source, trust=True if trust else None), seeds, points)
     folder = Path("results") / f"{Path(source).stem}-sweep" if out is None else out
@@ -117,16 +118,10 @@ def _swept(
         prepared, start = prepare(plan.study), perf_counter()
         run_task(Sweep(plan.study, 1, points), prepared, plan.tasks[-1])
         seconds = (perf_counter() - start) * plan.runs / 2
-        if not typer.confirm(f"{plan.runs} runs may take {_long(seconds)} on two cores. Go on?", err=True):
+        if not typer.confirm(
+            f"{plan.runs} runs may take {time_in_words(seconds)} on two cores. Go on?", err=True
+        ):
             raise typer.Exit(1)
     with bar(source) as show:
         rows = run_sweep(plan, folder, jobs=jobs, scheduler=scheduler, on_task=show)
     return plan, rows, folder
-
-
-def _long(seconds: float) -> str:
-    """A duration in words."""
-    for unit, size in (("years", 365 * 86400.0), ("days", 86400.0), ("hours", 3600.0)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{max(seconds / 60, 1):.0f} minutes"

@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from mampc.base.errors import MampcError, shown
+from mampc.base.errors import MampcError
 from mampc.cli.app import app
 from mampc.cli.console import console_for_tables, print_list
+from mampc.cli.numbers import matrix, number, row
 
 
 @app.command(name="plan-test")
@@ -74,11 +75,11 @@ def plan_test(
         raise MampcError(f"expected a name that ends in .csv, received {signal}")
     given: dict[str, Any] = {} if model is None else first_guess(StateSpace.load(model))
     told = {
-        "gain": _matrix("--gain", gain), "settling_time": _matrix("--settling-time", settling_time),
-        "noise": _row("--noise", noise), "dead_time": _matrix("--dead-time", dead_time),
-        "around": _row("--around", around), "max_amplitude": _row("--max-amplitude", max_amplitude),
-        "dt": None if dt is None else _number("--dt", dt), "integrating": integrating or None,
-        "accuracy": _number("--accuracy", accuracy),
+        "gain": matrix("--gain", gain), "settling_time": matrix("--settling-time", settling_time),
+        "noise": row("--noise", noise), "dead_time": matrix("--dead-time", dead_time),
+        "around": row("--around", around), "max_amplitude": row("--max-amplitude", max_amplitude),
+        "dt": None if dt is None else number("--dt", dt), "integrating": integrating or None,
+        "accuracy": number("--accuracy", accuracy),
     }  # fmt: skip
     given |= {name: value for name, value in told.items() if value is not None}
     missing = [name for name in ("gain", "settling_time", "noise") if name not in given]
@@ -95,35 +96,3 @@ def plan_test(
     console.print(hold_in_words(planned), soft_wrap=True, markup=False)
     print_list(console, "Note", planned.notes)
     console.print(f"Wrote {signal}", soft_wrap=True, markup=False)
-
-
-def _matrix(name: str, text: str | None) -> Any:
-    """One number, or rows between semicolons."""
-    if text is None:
-        return None
-    rows = [[_number(name, cell) for cell in row.split(",")] for row in text.split(";")]
-    if len({len(row) for row in rows}) > 1:
-        raise MampcError(f"{name}: expected rows of one length, received {shown(text)}")
-    return rows[0][0] if len(rows) == len(rows[0]) == 1 else rows
-
-
-def _row(name: str, text: str | None) -> Any:
-    if text is None:
-        return None
-    numbers = [_number(name, cell) for cell in text.split(",")]
-    return numbers[0] if len(numbers) == 1 else numbers
-
-
-def _number(name: str, text: str) -> float:
-    """A number, a share such as 5%, or a time with its unit."""
-    from mampc.study.values import time_in_seconds
-
-    try:
-        if text.strip().endswith("%"):
-            return float(text.strip().removesuffix("%")) / 100
-        try:
-            return float(text)
-        except ValueError:
-            return float(time_in_seconds(text))
-    except ValueError:
-        raise MampcError(f"{name}: expected numbers such as 2.5, received {shown(text)}") from None

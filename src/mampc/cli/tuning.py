@@ -10,6 +10,7 @@ import typer
 from mampc.base.errors import MampcError, shown
 from mampc.cli.app import app
 from mampc.cli.console import bar, complain, console_for_tables, progress
+from mampc.cli.numbers import number, row
 from mampc.cli.options import Jobs, Trust
 
 LARGEST_INCREASE = 10.0  # of the error; more is a percentage without its sign
@@ -75,7 +76,7 @@ def tune(
                 "tune: expected --u-min and --u-max with a model file, received one or none of them"
             )
         model = StateSpace.load(source)
-        limits = Limits(u_min=_numbers("--u-min", u_min), u_max=_numbers("--u-max", u_max))
+        limits = Limits(u_min=row("--u-min", u_min), u_max=row("--u-max", u_max))
         given: dict[str, Any] = {"limits": limits, "output_weight": even_weight(model, limits)}
     else:
         from mampc.study import load_study
@@ -109,20 +110,9 @@ def tune(
 
 def _share(text: str) -> float:
     """25% or 0.25 as a number."""
-    try:
-        number = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
-    except ValueError:
-        number = -1.0
-    if not 0 < number <= LARGEST_INCREASE:
+    share = number("--max-error-increase", text)
+    if not 0 < share <= LARGEST_INCREASE:
         raise MampcError(
             f"--max-error-increase: expected a share such as 25% or 0.25, received {shown(text)}"
         )
-    return number
-
-
-def _numbers(name: str, text: str) -> float | list[float]:
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        raise MampcError(f"{name}: expected numbers such as 0 or 0,10, received {shown(text)}") from None
-    return numbers[0] if len(numbers) == 1 else numbers
+    return share

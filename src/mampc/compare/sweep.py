@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.errors import MampcError, shown
+from mampc.base.files import made_folder
 from mampc.compare.fronts import Point
 from mampc.compare.journal import Journal
 from mampc.compare.knobs import variants
@@ -104,11 +105,7 @@ def run_sweep(
     """
     if jobs == 0 or jobs < -1:
         raise MampcError(f"--jobs: expected -1 for one a core, or a number of processes, received {jobs}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MampcError(f"--out: expected a folder that can be written, received: {error}") from None
-    journal = Journal(folder / "sweep.jsonl", sweep.identity)
+    journal = Journal(made_folder(folder) / "sweep.jsonl", sweep.identity)
     tasks = sweep.tasks
     missing = [task for task in tasks if task.name not in journal.done]
     on_task(len(tasks) - len(missing), len(tasks))

@@ -226,11 +226,10 @@ class Regulator:
             raise MampcError(f"state: expected a RegulatorState, received {type(state).__name__}")
         y = as_shaped("y", y, self._y_shape)
         memory, actuators, v_last = state.controller, state.actuators, state.measured_disturbance
+        in_manual = self.controller.manual_inputs(manual)
         if u_applied is not None:
             reported = as_shaped("u_applied", u_applied, self._u_shape)
-            inputs, actuators = self._actuators.update(
-                actuators, memory.inputs, reported, self.controller.manual_inputs(manual)
-            )
+            inputs, actuators = self._actuators.update(actuators, memory.inputs, reported, in_manual)
             if inputs is not memory.inputs:
                 memory = memory._replace(inputs=inputs)
         u_previous = memory.inputs[-1]
@@ -248,7 +247,6 @@ class Regulator:
             kind = "without" if self._compensation is None else "with"
             raise MampcError(f"state: expected one of a regulator {kind} valves, received another's")
         if tracked is not None and self._filter is not None:
-            in_manual = self.controller.manual_inputs(manual)
             reference, tracked = self._filter.update(
                 tracked, reference, self._samples, self._outputs(estimate, u_previous, v),
                 restart=in_manual is not None and bool(in_manual.all()),
@@ -273,7 +271,6 @@ class Regulator:
         )
         command, positions, memory = None, decision.u, decision.state
         if self._compensation is not None and state.command is not None:
-            in_manual = self.controller.manual_inputs(manual)
             last = state.command if in_manual is None else np.where(in_manual, u_previous, state.command)
             command, positions = self._compensation.decided(
                 positions, u_previous, last, *self._planner.range_now(limits)

@@ -63,14 +63,11 @@ class L1Search(HeuristicSearch):
     def __init__(self, settings: L1, condensed: CondensedQP, rules: MoveRules) -> None:
         super().__init__(settings, condensed, rules)
         self.settings = settings
-        full, v, n = condensed.program, condensed.n_violations, condensed.n_moves
-        H = np.zeros((v + 2 * n, v + 2 * n))
-        H[: v + n, : v + n] = full.H
-        H[v + n :, v + n :] = CURVATURE * np.diag(mean_curvature(condensed))
-        none, eye = np.zeros((n, v)), np.eye(n)
-        A = np.block([[full.A, np.zeros((len(full.A), n))], [none, -eye, eye], [none, eye, eye]])
+        eye, curvature = np.eye(condensed.n_moves), CURVATURE * mean_curvature(condensed)
         # Next to that little curvature of t moves are small numbers.
-        self._program = DaqpSolver(QuadraticProgram(H, A, full.n_simple), tolerance=1e-9 * np.sqrt(CURVATURE))
+        self._program = DaqpSolver(
+            with_sizes(condensed, eye, np.zeros_like(eye), curvature), tolerance=1e-9 * np.sqrt(CURVATURE)
+        )
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         proposed: dict[bytes, BoolArray] = {}
@@ -117,3 +114,22 @@ class L1Search(HeuristicSearch):
             else:
                 low = logarithm
         return met, count
+
+
+def with_sizes(condensed: CondensedQP, Z: Array, H: Array, curvature: Array) -> QuadraticProgram:
+    """The program in (violations, d, t) with t >= |Z d - z0|; z0 comes with the bounds of the last 2 n rows.
+
+    Args:
+        condensed: of n moves d.
+        Z: shape (n, n).
+        H: what the Hessian in d has beside that of the problem, shape (n, n).
+        curvature: of t, shape (n,).
+    """
+    full, v, n = condensed.program, condensed.n_violations, condensed.n_moves
+    hessian = np.zeros((v + 2 * n, v + 2 * n))
+    hessian[: v + n, : v + n] = full.H
+    hessian[v : v + n, v : v + n] += H
+    hessian[v + n :, v + n :] = np.diag(curvature)
+    none, eye = np.zeros((n, v)), np.eye(n)
+    A = np.block([[full.A, np.zeros((len(full.A), n))], [none, -Z, eye], [none, Z, eye]])
+    return QuadraticProgram(hessian, A, full.n_simple)

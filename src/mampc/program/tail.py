@@ -13,6 +13,7 @@ from mampc.base.errors import MampcError
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
+from mampc.systems.state_space import StateSpace
 
 
 def tail(problem: TrackingProblem, prediction: Prediction, parameter: Parameter) -> tuple[Array, Array]:
@@ -23,10 +24,8 @@ def tail(problem: TrackingProblem, prediction: Prediction, parameter: Parameter)
     """
     model = problem.model
     n, l, gamma = model.n_states, model.n_outputs, shrink(problem)
-    eye, zero = np.eye(n), np.zeros((n, l))
-    F = np.block([[model.A, eye, zero], [0 * eye, eye, zero], [zero.T, zero.T, np.eye(l)]])
-    E = np.hstack([-model.C, zero.T, np.eye(l)])
-    F *= np.sqrt(gamma)
+    E = np.hstack([-model.C, np.zeros((l, n)), np.eye(l)])
+    F = np.sqrt(gamma) * beyond_horizon(model)
     root = square_root(problem.set_point_weight) @ E @ F
     while True:  # doubling, P_2k = P_k + F^k' P_k F^k, with P = root' root: squares would lose digits
         added = root @ F
@@ -39,6 +38,13 @@ def tail(problem: TrackingProblem, prediction: Prediction, parameter: Parameter)
     zeta[2 * n :, parameter.final_reference] = np.eye(l)
     of_moves[2 * n :] *= -1.0
     return root @ zeta, -root @ of_moves
+
+
+def beyond_horizon(model: StateSpace) -> Array:
+    """What takes (x, b, a) one sample on where inputs stay, shape (2n + l, 2n + l)."""
+    n, l = model.n_states, model.n_outputs
+    eye, zero = np.eye(n), np.zeros((n, l))
+    return np.block([[model.A, eye, zero], [0 * eye, eye, zero], [zero.T, zero.T, np.eye(l)]])
 
 
 def shrink(problem: TrackingProblem) -> float:

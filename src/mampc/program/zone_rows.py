@@ -15,7 +15,7 @@ from mampc.base.checks import Array
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
-from mampc.program.tail import end_of_horizon, shrink
+from mampc.program.tail import beyond_horizon, end_of_horizon, shrink
 
 LONGEST = 4  # tail horizons, from which on one mean stands for all samples
 
@@ -58,9 +58,8 @@ def _tail_means(
     model, gamma = problem.model, shrink(problem)
     n, l = model.n_states, model.n_outputs
     zeta, of_moves = end_of_horizon(problem, prediction, parameter)
-    eye, zero = np.eye(n), np.zeros((n, l))
-    F = gamma * np.block([[model.A, eye, zero], [0 * eye, eye, zero], [zero.T, zero.T, np.eye(l)]])
-    E = np.hstack([model.C, zero.T, np.eye(l)])[problem.zoned]  # zeta ends with y - C x
+    F = gamma * beyond_horizon(model)
+    E = np.hstack([model.C, np.zeros((l, n)), np.eye(l)])[problem.zoned]  # zeta ends with y - C x
     power: Array = F
     total: Array = np.eye(len(F))
     length, sums, weights = 1, [], []

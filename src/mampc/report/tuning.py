@@ -8,7 +8,7 @@ from textwrap import fill
 from rich.table import Table
 
 from mampc.base.errors import MampcError
-from mampc.base.files import written_whole
+from mampc.base.files import made_folder, written_whole
 from mampc.compare.fronts import Estimate
 from mampc.compare.tuned_study import MODEL_FILE
 from mampc.compare.tuning import Tuned
@@ -43,11 +43,7 @@ def told(tuned: Tuned, wanted: str) -> str:
 
 def write_tuning(tuned: Tuned, study: Study, folder: Path, wanted: str, allowed: float | None) -> str | None:
     """Write tuned.toml, its model, the runs as front.csv and the front; returns why there is no figure, if so."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MampcError(f"--out: expected a folder that can be written, received: {error}") from None
-    tuned.problem.model.save(folder / MODEL_FILE)
+    tuned.problem.model.save(made_folder(folder) / MODEL_FILE)
     write_rows(tuned.rows, folder / "front.csv")
     comment = (
         f"{told(tuned, wanted)}\nWritten by mampc tune. A larger price makes fewer moves at a larger error."

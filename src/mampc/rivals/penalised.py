@@ -18,11 +18,12 @@ from mampc.base.errors import MampcError
 from mampc.base.words import Status
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
+from mampc.methods.l1 import with_sizes
 from mampc.methods.method import HELD_BY, Plan
 from mampc.program.daqp import DaqpSolver
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
-from mampc.program.qp import UNBOUNDED, QuadraticProgram
+from mampc.program.qp import UNBOUNDED
 from mampc.program.sample import Sample
 from mampc.program.steady import Steady, SteadyTarget
 from mampc.program.tail import square_root
@@ -142,18 +143,10 @@ class Penalised(Controller):
         """The solver for quadratic terms q; it stays while they do."""
         key = q.tobytes()
         if self._kept is None or self._kept[0] != key:
-            full, v, n = self.condensed.program, self.condensed.n_violations, self.condensed.n_moves
-            H = np.zeros((v + 2 * n, v + 2 * n))
-            H[: v + n, : v + n] = full.H
-            H[v : v + n, v : v + n] += self._z.T @ (q[:, None] * self._z) + H_terminal
             curvature = CURVATURE * (np.diag(self.condensed.H) * self._size**2).mean()
-            H[v + n :, v + n :] = curvature * np.eye(n)
-            eye, none = np.eye(n), np.zeros((n, v))
-            A = np.block([
-                [full.A, np.zeros((len(full.A), n))], [none, -self._z, eye], [none, self._z, eye],
-            ])  # fmt: skip
-            solver = DaqpSolver(QuadraticProgram(H, A, full.n_simple), tolerance=1e-9 * np.sqrt(CURVATURE))
-            self._kept = key, solver
+            H = self._z.T @ (q[:, None] * self._z) + H_terminal
+            program = with_sizes(self.condensed, self._z, H, np.full(len(q), curvature))
+            self._kept = key, DaqpSolver(program, tolerance=1e-9 * np.sqrt(CURVATURE))
         return self._kept[1]
 
     def _without_nothing(self, d: Array, z0: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import as_vector
-from mampc.base.errors import MampcError, StudyError
+from mampc.base.errors import said_at
 from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.loop.defaults import default_estimator
@@ -38,46 +38,35 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
     counts = study.estimator.value_of_information and isinstance(estimator, LoadBank)
     counts = counts and any(type(one) is MAMPC for one in controller.each)
     smooth = None if table.reference_filter is None else table.reference_filter.made()
-    try:
+    with said_at(f"controllers, {table.name!r}: "):
         return Regulator(
-            controller,
-            estimator,
-            reference_filter=smooth,
-            valves=valves,
-            value_of_information=counts,
-            price_follows_noise=counts and study.estimator.price_follows_noise,
-            **_sensors(study),
-        )
-    except MampcError as error:
-        raise StudyError(f"controllers, {table.name!r}: {error}") from None
+            controller, estimator, reference_filter=smooth, valves=valves, value_of_information=counts,
+            price_follows_noise=counts and study.estimator.price_follows_noise, **_sensors(study),
+        )  # fmt: skip
 
 
 def _executed(table: ControllerTable, valves: Valves, n_inputs: int) -> ControllerTable:
     """The controller with moves that valves execute, and some more."""
     assert table.rules is not None
-    try:
+    with said_at(f"controllers, {table.name!r}: "):
         least = EXECUTED * as_vector("actuators.jump", valves.jump, n_inputs)
         size = np.maximum(as_vector("min_size", table.rules.min_size, n_inputs), least)
-    except MampcError as error:
-        raise StudyError(f"controllers, {table.name!r}: {error}") from None
     return table.model_copy(update={"rules": table.rules.model_copy(update={"min_size": size.tolist()})})
 
 
 def problem_of(study: Study, model: StateSpace) -> TrackingProblem:
     """The tracking problem that a study's table describes."""
     table = study.problem
-    try:
+    with said_at("[problem] "):
         return TrackingProblem(
             model, **table.model_dump(exclude={"limits"}), limits=Limits(**table.limits.model_dump())
         )
-    except MampcError as error:
-        raise StudyError(f"[problem] {error}") from None
 
 
 def _controller(
     problem: TrackingProblem, table: ControllerTable, tables: Sequence[ControllerTable]
 ) -> Controller:
-    try:
+    with said_at(f"controllers, {table.name!r}: "):
         if table.method == BANK:
             named = {other.name: other for other in tables}
             return ControllerBank(
@@ -86,11 +75,9 @@ def _controller(
         if table.method in RIVALS:
             around = None if table.around == "mpc" else _sparse(problem, table, table.around, {})
             return rival(table.method, problem, table.settings, around=around)
-        return (
-            MPC(problem) if table.method == "mpc" else _sparse(problem, table, table.method, table.settings)
-        )
-    except MampcError as error:
-        raise StudyError(f"controllers, {table.name!r}: {error}") from None
+        if table.method == "mpc":
+            return MPC(problem)
+        return _sparse(problem, table, table.method, table.settings)
 
 
 def _sparse(problem: TrackingProblem, table: ControllerTable, method: str, settings: dict[str, Any]) -> MAMPC:
@@ -103,7 +90,7 @@ def _sparse(problem: TrackingProblem, table: ControllerTable, method: str, setti
 
 def _estimator(table: EstimatorTable, controller: Controller) -> Estimator:
     problem = controller.problem
-    try:
+    with said_at("[estimator] "):
         if table.kind == "load_bank":
             if table.price_follows_noise and table.measurement_noise is not None:
                 return LoadBank(problem.model, noise=table.measurement_noise, guessed=True)
@@ -112,14 +99,10 @@ def _estimator(table: EstimatorTable, controller: Controller) -> Estimator:
             told = table.model_dump(include={"disturbance", "measurement_noise", "drift", "input_noise"})
             return KalmanFilter.offset_free(problem.model, **told)
         return default_estimator(controller, table.measurement_noise)
-    except MampcError as error:
-        raise StudyError(f"[estimator] {error}") from None
 
 
 def _sensors(study: Study) -> dict[str, Any]:
     checks = study.sensors.model_dump()
     blind = checks.pop("max_blind_steps")
-    try:
+    with said_at("[sensors] "):
         return {"sensors": SensorChecks(**checks), "max_blind_steps": blind}
-    except MampcError as error:
-        raise StudyError(f"[sensors] {error}") from None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array, as_vector
-from mampc.base.errors import MampcError, StudyError, shown
+from mampc.base.errors import StudyError, said_at, shown
 from mampc.controllers import ControllerBank
 from mampc.identification import Identified, IOData, excite, n4sid
 from mampc.loop.batch import Batch, simulate_batch
@@ -152,18 +152,11 @@ def run_seeds(
     if scenario.mismatch is not None:
         plant = [_plant(study, prepared, scenario, seed) for seed in seeds]
     acting = _acting(study, prepared, scenario)
-    try:
+    with said_at(f"scenarios, {scenario.name!r}: "):
         return simulate_batch(
-            plant,
-            regulator,
-            seeds=seeds,
-            preview=study.reference.preview,
-            progress=False,
-            variant=_variants(study, scenario, regulator),
-            **acting,
-        )
-    except MampcError as error:
-        raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
+            plant, regulator, seeds=seeds, preview=study.reference.preview, progress=False,
+            variant=_variants(study, scenario, regulator), **acting,
+        )  # fmt: skip
 
 
 def _course(
@@ -171,13 +164,9 @@ def _course(
 ) -> tuple[Plant | StateSpace, Course]:
     """What a scenario makes of the plant, and what acts on it."""
     plant = _plant(study, prepared, scenario, scenario.seed)
-    acting = _acting(study, prepared, scenario)
-    try:
-        return plant, acting_on(
-            plant, regulator, steps=None, variant=_variants(study, scenario, regulator), **acting
-        ).drawn(scenario.seed)
-    except MampcError as error:
-        raise StudyError(f"scenarios, {scenario.name!r}: {error}") from None
+    acting = _acting(study, prepared, scenario) | {"variant": _variants(study, scenario, regulator)}
+    with said_at(f"scenarios, {scenario.name!r}: "):
+        return plant, acting_on(plant, regulator, steps=None, **acting).drawn(scenario.seed)
 
 
 def _variants(study: Study, scenario: ScenarioTable, regulator: Regulator) -> list[str] | None:
@@ -237,10 +226,8 @@ def load_of(study: Study, model: StateSpace, table: LoadTable) -> Load:
 
 def _disturbance(study: Study, scenario: ScenarioTable, value: Values, usual: Any) -> Array:
     """A disturbance that takes a value at the scenario's sample, one row per sample."""
-    try:
+    with said_at(f"scenarios, {scenario.name!r}, disturbances: "):
         return steps(study.steps, usual, [(scenario.disturbance_at, value)])
-    except MampcError as error:
-        raise StudyError(f"scenarios, {scenario.name!r}, disturbances: {error}") from None
 
 
 def _operating_point(study: Study, plant: Plant | StateSpace) -> tuple[Array, Array]:
@@ -281,10 +268,8 @@ def _reference(study: Study, prepared: Prepared) -> Array:
         raise StudyError(
             f"reference.initial: expected {len(plant.names.outputs)} values, received {len(table.initial)}"
         )
-    try:
+    with said_at("reference."):
         staircase = steps(study.steps, table.initial, [(change.at, change.value) for change in table.changes])
-    except MampcError as error:
-        raise StudyError(f"reference.{error}") from None
     if not table.relative:
         return staircase
     usual = np.concatenate([prepared.u_op, prepared.v_op])

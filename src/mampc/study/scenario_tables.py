@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import said_at
 from mampc.loop import loads
 from mampc.loop.loads import Load
 from mampc.loop.valves import Valves
@@ -79,10 +79,8 @@ class LoadTable(Table):
         if wrong or missing:
             what = f"no {', '.join(sorted(wrong))}" if wrong else f"{', '.join(sorted(missing))}"
             raise ValueError(f"{what} for a load of kind {self.kind!r}")
-        try:
+        with said_at("other settings of the load: ", ValueError):
             load: Load = kind(**given)
-        except MampcError as error:
-            raise ValueError(f"other settings of the load: {error}") from None
         return load
 
 
@@ -92,10 +90,8 @@ class ValvesTable(Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> ValvesTable:
-        try:
+        with said_at("other valves: ", ValueError):
             Valves(**self.model_dump())
-        except MampcError as error:
-            raise ValueError(f"other valves: {error}") from None
         return self
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, InstanceOf, model_validator
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import said_at
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.valves import Valves
 from mampc.methods.registry import METHODS, method_of
@@ -121,10 +121,8 @@ class ActuatorsTable(Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> ActuatorsTable:
-        try:
+        with said_at("other actuators: ", ValueError):
             self.valves()
-        except MampcError as error:
-            raise ValueError(f"other actuators: {error}") from None
         return self
 
 
@@ -182,10 +180,8 @@ class RulesTable(Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> RulesTable:
-        try:
+        with said_at("other rules: ", ValueError):
             self.made()
-        except MampcError as error:
-            raise ValueError(f"other rules: {error}") from None
         return self
 
 
@@ -235,17 +231,13 @@ class ControllerTable(Table):
             raise ValueError(f"a method, one of {known}; received {self.method!r}")
         if self.rules is None:
             raise ValueError(f"rules for the method {self.method!r}, such as rules = {{ max_moves = 3 }}")
-        try:
+        with said_at("other settings: ", ValueError):
             method_of(self.method, self.settings)
-        except MampcError as error:
-            raise ValueError(f"other settings: {error}") from None
         return self
 
     def _as_rival(self) -> ControllerTable:
-        try:
+        with said_at("other settings: ", ValueError):
             check_settings(self.method, self.settings)
-        except MampcError as error:
-            raise ValueError(f"other settings: {error}") from None
         if self.around != "mpc" and (self.method not in RULES or self.around not in METHODS):
             raise ValueError(
                 f"around one of {', '.join(('mpc', *METHODS))}, with {', '.join(RULES)} only; received {self.around!r}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mampc.base.checks import Array, as_vector
-from mampc.base.errors import MampcError, StudyError
+from mampc.base.errors import said_at
 from mampc.study.schema import Study
 
 HOURS_A_YEAR = 8766.0
@@ -53,10 +53,8 @@ def ratings_of(study: Study, n_inputs: int) -> Ratings:
     arrays = {}
     for name in ("dead_band", "starts_per_hour", "million_starts"):
         value = getattr(table, name)
-        try:
+        with said_at("actuators."):
             arrays[name] = None if value is None else as_vector(name, value, n_inputs)
-        except MampcError as error:
-            raise StudyError(f"actuators.{error}") from None
     millions, band = arrays["million_starts"], arrays["dead_band"]
     assert band is not None
     return Ratings(band, arrays["starts_per_hour"], None if millions is None else 1e6 * millions)

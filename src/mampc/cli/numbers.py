@@ -1,0 +1,38 @@
+"""Numbers on the command line: shares, times with a unit, rows between commas, matrices between semicolons."""
+
+from __future__ import annotations
+
+from mampc.base.errors import MampcError, shown
+
+
+def number(name: str, text: str) -> float:
+    """A number, a share such as 5%, or a time with its unit in seconds; `name` is the option."""
+    from mampc.study.values import time_in_seconds
+
+    try:
+        if text.strip().endswith("%"):
+            return float(text.strip().removesuffix("%")) / 100
+        try:
+            return float(text)
+        except ValueError:
+            return float(time_in_seconds(text))
+    except ValueError:
+        raise MampcError(f"{name}: expected numbers such as 2.5, received {shown(text)}") from None
+
+
+def row(name: str, text: str | None) -> float | list[float] | None:
+    """One number, or several between commas."""
+    if text is None:
+        return None
+    numbers = [number(name, cell) for cell in text.split(",")]
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def matrix(name: str, text: str | None) -> float | list[list[float]] | None:
+    """One number, or rows between semicolons."""
+    if text is None:
+        return None
+    rows = [[number(name, cell) for cell in line.split(",")] for line in text.split(";")]
+    if len({len(line) for line in rows}) > 1:
+        raise MampcError(f"{name}: expected rows of one length, received {shown(text)}")
+    return rows[0][0] if len(rows) == len(rows[0]) == 1 else rows
