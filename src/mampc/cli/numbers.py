@@ -5,7 +5,7 @@ from __future__ import annotations
 from mampc.base.errors import MampcError, shown
 
 
-def number(name: str, text: str) -> float:
+def number(name: str, text: str, expected: str = "numbers such as 2.5") -> float:
     """A number, a share such as 5%, or a time with its unit in seconds; `name` is the option."""
     from mampc.study.values import time_in_seconds
 
@@ -17,7 +17,7 @@ def number(name: str, text: str) -> float:
         except ValueError:
             return float(time_in_seconds(text))
     except ValueError:
-        raise MampcError(f"{name}: expected numbers such as 2.5, received {shown(text)}") from None
+        raise MampcError(f"{name}: expected {expected}, received {shown(text)}") from None
 
 
 def row(name: str, text: str | None) -> float | list[float] | None:

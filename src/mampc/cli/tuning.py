@@ -110,9 +110,8 @@ def tune(
 
 def _share(text: str) -> float:
     """25% or 0.25 as a number."""
-    share = number("--max-error-increase", text)
+    expected = "a share such as 25% or 0.25"
+    share = number("--max-error-increase", text, expected)
     if not 0 < share <= LARGEST_INCREASE:
-        raise MampcError(
-            f"--max-error-increase: expected a share such as 25% or 0.25, received {shown(text)}"
-        )
+        raise MampcError(f"--max-error-increase: expected {expected}, received {shown(text)}")
     return share
