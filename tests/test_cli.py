@@ -136,18 +136,6 @@ def test_a_process_of_its_own_complains_alike(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (2, here.stdout, here.stderr)
 
 
-def test_the_readme_example_runs(tmp_path):
-    from pathlib import Path
-
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
-    code = readme.split("```python")[1].split("```")[0]
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert "tracking_error" in done.stdout
-
-
 def test_identify_replaces_models_and_nothing_else(record, tmp_path):
     data = tmp_path / "data.json"
     data.write_bytes(record.read_bytes())

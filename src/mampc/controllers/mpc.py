@@ -5,11 +5,19 @@ from __future__ import annotations
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
 from mampc.methods.method import Plan
+from mampc.program.problem import TrackingProblem
 from mampc.program.sample import Sample
 
 
 class MPC(Controller):
     """Model predictive control of a `TrackingProblem`; see there for the cost and the limits.
+
+    Args:
+        problem: what to track, over which horizons, at what weights and within what limits.
+        time_limit: seconds that a sample may take; then the previous inputs are held. None for no limit.
+
+    Raises:
+        MampcError: something else than a problem, or a limit that is not positive.
 
     Example:
         >>> import mampc
@@ -20,6 +28,9 @@ class MPC(Controller):
         >>> decision.status.value
         'optimal'
     """
+
+    def __init__(self, problem: TrackingProblem, *, time_limit: float | None = None) -> None:
+        super().__init__(problem, time_limit=time_limit)
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
         return self._unrestricted(sample, state)

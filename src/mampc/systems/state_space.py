@@ -120,6 +120,7 @@ class StateSpace:
 
     @property
     def n_states(self) -> int:
+        """n."""
         return len(self.A)
 
     @property
@@ -139,16 +140,13 @@ class StateSpace:
 
     @property
     def n_outputs(self) -> int:
+        """l."""
         return len(self.C)
 
     @property
     def is_discrete(self) -> bool:
+        """Whether it has a sample time; else it is in continuous time."""
         return self.dt > 0
-
-    @property
-    def _shift(self) -> Array:
-        """What A is in a steady state of all modes: I, in continuous time 0."""
-        return np.eye(self.n_states) * self.is_discrete
 
     def poles(self) -> ComplexArray:
         """Eigenvalues of A, shape (n,)."""
@@ -165,7 +163,7 @@ class StateSpace:
         Raises:
             MampcError: the model integrates, so that no finite gain exists.
         """
-        singular = self._shift - self.A
+        singular = np.eye(self.n_states) * self.is_discrete - self.A
         if self.n_states and np.linalg.cond(singular) > 1e13:
             raise MampcError(
                 "dc_gain: expected a model without integrators, received a pole at zero frequency"
@@ -246,7 +244,8 @@ class StateSpace:
         if inputs.shape == self.u_op.shape:
             inputs = np.concatenate([inputs, self.v_op])
         change = as_vector("u", inputs, self.B.shape[1]) - self.all_inputs_op
-        x: Array = np.linalg.lstsq(self._shift - self.A, self.B @ change)[0]
+        shift = np.eye(self.n_states) * self.is_discrete
+        x: Array = np.linalg.lstsq(shift - self.A, self.B @ change)[0]
         return x
 
     def response(self, u: Any, x0: Any = None) -> Array:
