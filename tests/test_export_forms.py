@@ -289,3 +289,104 @@ def test_worksheets_with_the_same_columns_are_asked_about(tmp_path):
     book.save(tmp_path / "export.xlsx")
     with pytest.raises(MampcError, match=r"one worksheet.*2 of them; save"):
         mampc.read_export(tmp_path / "export.xlsx", inputs="u", outputs="y")
+
+
+LOGGERS = {
+    "remarks behind a #": rows(
+        lambda k, u, y: f"{stamp(k)},{u},{y}", ["#NAMES", "time,u,y", "#TYPES", "date,F,F", '#ROWS,"20"']
+    ),
+    "a header behind a #": rows(lambda k, u, y: f"{10 * k} {u} {y}", ["# made by numpy", "# time u y"]),
+    "a header behind a %": rows(lambda k, u, y: f"  {10 * k:.5e}  {u:.5e}  {y:.5e}", ["% t u y"]),
+    "numbers of rows without a name": rows(
+        lambda k, u, y: f'"{k + 1}" "{stamp(k)}" {u} {y}', ['"t" "u" "y"']
+    ),
+    "a name without a column": rows(
+        lambda k, u, y: f"{10 * k}\t{u}\t{y}", ["Writer_Version\t2", "***End***", "X_Value\tu\ty\tComment"]
+    ),
+    "pages": rows(
+        lambda k, u, y: (
+            f"Page {k // 5} of 4\r\n\r\ntime;u;y\r\n;%;°C\r\n{stamp(k)};{u};{y}"
+            if k % 15 == 14
+            else f"{stamp(k)};{u};{y}"
+        ),
+        ["time;u;y", ";%;°C"],
+    ),
+    "tables of Influx": rows(
+        lambda k, u, y: (
+            f",,0,{stamp(0)},{stamp(900)},{stamp(k)},{u},u\r\n,,1,{stamp(0)},{stamp(900)},{stamp(k)},{y},y"
+        ),
+        [
+            "#datatype,string,long,dateTime,dateTime,dateTime,double,string",
+            ",result,table,_start,_stop,_time,_value,_field",
+        ],
+    ),
+    "spans": rows(lambda k, u, y: f"{30 + k}:00:00,{u},{y}", ["elapsed,u,y"]),
+    "spans of pandas": rows(lambda k, u, y: f"{k // 24} days {k % 24:02}:00:00,{u},{y}", [",u,y"]),
+    "dates in Japanese": rows(
+        lambda k, u, y: f"{stamp(k, '%Y年%m月%d日 %H時%M分%S秒')},{u},{y}", ["日時,u,y"]
+    ),
+}
+
+
+@pytest.mark.parametrize("form", list(LOGGERS))
+def test_what_loggers_and_programs_write_around_their_numbers(tmp_path, form):
+    assert_whole(read(tmp_path, LOGGERS[form]), dt=3600.0 if "spans" in form else 10.0)
+
+
+def test_a_row_with_too_few_fields_and_no_number_is_a_missing_sample_and_one_with_a_number_is_refused(
+    tmp_path,
+):
+    content = rows(lambda k, u, y: "broken" if k == 7 else f"{u},{y}", ["u,y"])
+    assert [len(record) for record in read(tmp_path, content, dt=10.0).records] == [7, 12]
+    content = rows(lambda k, u, y: f"{u}" if k == 7 else f"{u},{y}", ["u,y"])
+    with pytest.raises(
+        MampcError, match="expected 2 fields, as many as names in row 1, in row 9, received 1"
+    ):
+        read(tmp_path, content, dt=10.0)
+
+
+def test_an_error_of_a_spreadsheet_is_no_remark(tmp_path):
+    content = rows(lambda k, u, y: "#N/A,#N/A" if k == 7 else f"{u},{y}", ["u,y"])
+    assert [len(record) for record in read(tmp_path, content, dt=10.0).records] == [7, 12]
+
+
+def test_texts_in_other_encodings(tmp_path):
+    content = rows(lambda k, u, y: f"{stamp(k)},{u},{y}", ["日時,弁開度[%],温度"]).encode("cp932")
+    path = tmp_path / "export.csv"
+    path.write_bytes(content)
+    names = {"inputs": "弁開度", "outputs": "温度"}
+    with pytest.raises(MampcError, match=r"unless its encoding is passed \(--encoding\)"):
+        read_export(path, **names)
+    with pytest.raises(MampcError, match="encoding: expected one such as 'cp932', received 'nonsense'"):
+        read_export(path, **names, encoding="nonsense")
+    assert_whole(read_export(path, **names, encoding="cp932"))
+
+
+@pytest.mark.parametrize("start", [b"\x1f\x8b\x08", b"PK\x05\x06" + bytes(18), b"BZh9"])
+def test_archives_are_to_be_unpacked(tmp_path, start):
+    path = tmp_path / "export.zip"
+    path.write_bytes(start)
+    with pytest.raises(MampcError, match="unpack it first"):
+        read_export(path, inputs="u", outputs="y")
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_values_that_leap_away_or_stay_are_told_and_kept(tmp_path, scale):
+    rng = np.random.default_rng(4)
+    y = scale * (200 + np.cumsum(rng.standard_normal(400)))
+    u = np.repeat(rng.choice([1.0, 2.0], 50), 8)
+    plain = [f"{u[k]},{y[k]:.9g}" for k in range(400)]
+
+    def notes(lines):
+        path = tmp_path / "export.csv"
+        path.write_text("\n".join(["u,y", *lines]))
+        return " ".join(read_export(path, inputs="u", outputs="y", dt=1.0).notes)
+
+    assert not notes(plain)
+    spikes = [f"{u[k]},0" if k in (50, 51, 90) else line for k, line in enumerate(plain)]
+    assert (
+        "y: 3 values far from those before and after, in rows 52, 53 and 92 (the first is 0 after"
+        in notes(spikes)
+    )
+    stuck = [f"{u[k]},{y[60]:.9g}" if 60 <= k < 75 else line for k, line in enumerate(plain)]
+    assert "for 15 samples from row 62 on, and moves nearly always elsewhere" in notes(stuck)

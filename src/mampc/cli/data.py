@@ -25,6 +25,9 @@ TimeFormat = Annotated[
 ]
 TimeZone = Annotated[str | None, typer.Option(help="Of local time stamps, such as Europe/Berlin.")]
 Decimal = Annotated[str | None, typer.Option(help="Decimal mark, . or , where it is in doubt.")]
+Encoding = Annotated[
+    str | None, typer.Option(help="Of a text that is not UTF-8, such as cp932; default Windows-1252.")
+]
 Bad = Annotated[
     list[str] | None, typer.Option(help="A further word or number in place of a missing value; repeat it.")
 ]
@@ -55,6 +58,7 @@ def inspect(
     time_format: TimeFormat = None,
     time_zone: TimeZone = None,
     decimal: Decimal = None,
+    encoding: Encoding = None,
     bad: Bad = None,
     good: Good = None,
     ranges: Ranges = None,
@@ -81,6 +85,7 @@ def inspect(
     reading = _reading(
         inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
+        encoding=encoding,
     )  # fmt: skip
     target = export.parent / f"{export.stem}-columns.png" if out is None else out
     with progress() as show:
@@ -122,6 +127,7 @@ def identify(
     time_format: TimeFormat = None,
     time_zone: TimeZone = None,
     decimal: Decimal = None,
+    encoding: Encoding = None,
     bad: Bad = None,
     good: Good = None,
     ranges: Ranges = None,
@@ -164,6 +170,7 @@ def identify(
     reading = _reading(
         inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
+        encoding=encoding,
     )  # fmt: skip
     settings = {
         "order": order, "weighting": weighting, "block_rows": block_rows, "feedthrough": feedthrough,

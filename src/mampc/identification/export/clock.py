@@ -22,6 +22,7 @@ from mampc.identification.export.stamps import (
     SECONDS,
     TimeReading,
     clock_put_back,
+    elapsed,
     from_stamps,
     iso_stamps,
     plain_stamps,
@@ -96,7 +97,10 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
         if len(columns) == 2:
             hours = sheet.column(columns[1])
             cells = [f"{day} {hour}".strip() for day, hour in zip(cells, hours, strict=True)]
-        if not isinstance(cells, list):
+        if isinstance(cells, list) and how.time_format is None and (spans := elapsed(cells)) is not None:
+            findings.note(f"times in column {name!r} are spans such as {spans[0]!r}")
+            seconds, origin = spans[1], None
+        elif not isinstance(cells, list):
             seconds, origin = since_first(cells, how, sheet, findings)
         else:
             seconds, origin = from_stamps(cells, how, sheet, name, findings)
@@ -167,6 +171,9 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
         )
     ]
     found = stamps or [*dates, *hours] or numeric
+    found = [
+        at for at in found if len(set(_sampled(sheet, at))) > 1
+    ] or found  # others hold the export's own span
     if len(found) > 1 and _all_alike([sheet.column(at) for at in found]):
         findings.note(f"{len(found)} columns of times are the same, as {sheet.header[found[0]]!r}")
     elif len(found) > 1:

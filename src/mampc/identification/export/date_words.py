@@ -25,6 +25,7 @@ ZONE = re.compile(rf" ?\b({'|'.join(ZONES)})\b")
 YEAR_LAST = re.compile(r"^(\w+ \d+) (\d+:[\d:.,]+) ?([+-]\d{4})?,? (\d{4})$")
 JOINED = re.compile(r"(/\d{4}):(\d\d:)")
 OFFSET = re.compile(r"(:\d\d(?:[.,]\d+)?(?: [AaPp][Mm])?) ([+-]\d\d:?\d\d)$")
+KANJI = str.maketrans({"年": "-", "月": "-", "日": " ", "時": ":", "时": ":", "分": ":", "秒": " "})
 DAY = re.compile(r"^(\d{1,2})\. ?(?=[^\W\d_])")
 
 
@@ -33,6 +34,8 @@ def plain_date(stamp: str) -> str:
 
     "Thu Nov 26 21:00:00 CET 2026" becomes "Nov 26 2026 21:00:00+0100", "02. März 2026 06:00" "02 Mar 2026 06:00".
     """
+    if "年" in stamp:
+        return " ".join(stamp.translate(KANJI).split()).rstrip(":")
     if not any(map(str.isalpha, stamp)):
         return OFFSET.sub(r"\1\2", stamp)
     first = WEEKDAY.match(stamp)

@@ -58,6 +58,8 @@ def make_grid(
             )
             return None
         return Grid(dt, np.arange(len(values)), np.arange(len(values)) * dt)
+    if any("no date" in doubt for doubt in findings.doubts):
+        return None
     order = _in_order(clock, numbers, findings)
     order = _each_once(order, clock.seconds, values, numbers, findings)
     if any("more than once" in doubt for doubt in findings.doubts):

@@ -12,6 +12,9 @@ from mampc.identification.export.findings import Findings
 
 UNIT = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")
 
+NOT_UTF_8 = "text is not UTF-8: read as Windows-1252 (Western European)"
+REMARK = re.compile(r"%|#(?!N/A|REF!|VALUE!|DIV/0!|NAME\?|NUM!|NULL!)")  # spreadsheets' errors are cells
+
 Row: TypeAlias = tuple[int, list[str]]  # its number in the file, its cells
 
 
@@ -44,6 +47,8 @@ def require_columns(
         if name not in header
     }
     hints = [f"did you mean {guess!r} for {name!r}?" for name, guess in guesses.items() if guess]
+    if NOT_UTF_8 in findings.notes:
+        hints.append(f"{NOT_UTF_8}, unless its encoding is passed (--encoding)")
     if any(name in header for name in missing):
         hints.append("a name that stands twice says nothing: rename columns")
     elif all(name in cells for name in missing):
@@ -53,6 +58,48 @@ def require_columns(
         "; ".join([f"expected one column {wanted}, received columns {shown(list(header), 400)}", *hints])
     )
     findings.require_none()
+
+
+def remarks_last(head: Sequence[Row]) -> list[Row]:
+    """Rows among which a header is looked for: those behind a # or % come last, without it and then with it."""
+    marked = [(number, row) for number, row in head if REMARK.match(row[0])]
+    bare = [(number, [row[0].lstrip("#% "), *row[1:]]) for number, row in marked]
+    return [
+        *(line for line in head if line not in marked),
+        *((number, row if row[0] else row[1:]) for number, row in bare if any(row)),
+        *marked,
+    ]
+
+
+def fitted_header(
+    header: tuple[str, ...],
+    under: Sequence[Row],
+    separator: str | None,
+    names: Sequence[str],
+    findings: Findings,
+) -> tuple[str, ...]:
+    """The header as wide as the rows under it.
+
+    R leaves out the name above the numbers of rows; LabVIEW names a last column that no row has. Not between
+    commas or spaces, which may stand in names and numbers too.
+    """
+    rows = [row for _, row in under if any(map(is_number_like, row[1:]))]
+    widths = {len(row) for row in rows}
+    if len(widths) != 1 or separator == ",":
+        return header
+    [width] = widths
+    counts = [str(k) for k in range(1, len(rows) + 1)]
+    if width == len(header) + 1 and [row[0] for row in rows] == counts:
+        findings.note("the first column has no name: taken as numbers of rows")
+        return ("", *header)
+    left = header[:width]
+    known = all(find_column(left, name) is not None for name in names)
+    if separator not in (None, " ") and len(left) < len(header) and known:
+        findings.note(
+            f"the header has more names than rows have fields; left out: {', '.join(header[width:])}"
+        )
+        return left
+    return header
 
 
 def header_with(head: Sequence[Row], names: Sequence[str]) -> int | None:

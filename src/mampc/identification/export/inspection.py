@@ -19,6 +19,7 @@ from mampc.identification.export.numbers import Column, read_numbers, says_numbe
 from mampc.identification.export.quality import drop_bad_quality, is_quality
 from mampc.identification.export.reading import ReadingOptions, listed, readings
 from mampc.identification.export.sheet import Sheet
+from mampc.identification.export.suspects import note_suspects
 from mampc.identification.export.tall import open_table
 
 HELD = 0.5  # share of samples: what keeps its value more often moves in steps
@@ -105,7 +106,7 @@ def inspect_export(
     how, reading = readings(options, wanted or None)
     if dt is not None:
         dt = as_number("dt", dt, 0.0, exclusive=True)
-    sheet = open_table(source, wanted, how, findings)
+    sheet = open_table(source, wanted, how, findings, options.get("encoding"))
     taken = [at for name in wanted if (at := find_column(sheet.header, name)) is not None]
     qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet, at)]
     clock = read_clock(sheet, [*taken, *qualities], how, findings)
@@ -135,6 +136,9 @@ def inspect_export(
     elif clock is not None:
         order = np.argsort(clock.seconds, kind="stable")[: np.count_nonzero(~np.isnan(clock.seconds))]
         seconds = clock.seconds[order]
+    for column in columns:
+        if column.name not in (*listed(inputs), *listed(disturbances)):
+            note_suspects(column.name, column.values[order], sheet.numbers[order], findings)
     summaries = tuple(
         _summary(column, sheet.units.get(positions[column.name], column.unit), order) for column in columns
     )

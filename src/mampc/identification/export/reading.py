@@ -22,6 +22,7 @@ from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Reading, read_numbers
 from mampc.identification.export.quality import drop_bad_quality, quality_columns
 from mampc.identification.export.stamps import TimeReading
+from mampc.identification.export.suspects import note_suspects
 from mampc.identification.export.tall import open_table
 
 
@@ -33,6 +34,7 @@ class ReadingOptions(TypedDict, total=False):
     time_format: of time stamps, as in `strptime`.
     time_zone: of local time stamps, such as "Europe/Berlin".
     decimal: "." or ",".
+    encoding: of a text that is neither UTF-8 nor UTF-16, such as "cp932"; default Windows-1252.
     bad: further words and numbers that stand in the place of a missing value.
     good: words of quality columns that mean a good value.
     ranges: lowest and highest believable value of columns, {"TI101": (0.0, 200.0)}.
@@ -45,6 +47,7 @@ class ReadingOptions(TypedDict, total=False):
     time_format: str | None
     time_zone: str | None
     decimal: str | None
+    encoding: str | None
     bad: Sequence[str]
     good: Sequence[str]
     ranges: Mapping[str, tuple[float, float]]
@@ -106,7 +109,7 @@ def read_export(
     how, reading = readings(options, wanted)
     fill = as_whole("fill", options.get("fill", 0), 0)
 
-    table = _read_table(source, names, how, reading, listed(options.get("good", ())), findings)
+    table = _read_table(source, names, how, reading, options, findings)
     grid = make_grid(table.clock, table.values, table.numbers, dt, findings)
     findings.require_none()
     assert grid is not None  # else there is a doubt
@@ -136,18 +139,18 @@ def _read_table(
     names: Names,
     how: TimeReading,
     reading: Reading,
-    good: Sequence[str],
+    options: ReadingOptions,
     findings: Findings,
 ) -> _Table:
     wanted = (*names.inputs, *names.disturbances, *names.outputs)
-    sheet = open_table(source, wanted, how, findings)
+    sheet = open_table(source, wanted, how, findings, options.get("encoding"))
     positions = {name: _position(sheet.header, name) for name in wanted}
     units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
     quality = tuple(quality_columns(sheet, positions))
     clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
     columns, values = read_numbers(sheet, positions, reading, findings, (*names.inputs, *names.disturbances))
     units = {column.name: column.unit for column in columns if column.unit} | units
-    drop_bad_quality(sheet, columns, positions, good, findings)
+    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
     for column in columns:
         if column.marks:
             findings.change(str(column))
@@ -161,6 +164,8 @@ def _cut(table: _Table, grid: Grid, fill: int, findings: Findings) -> tuple[list
     if not np.array_equal(grid.order, np.arange(len(values))):
         values = values[grid.order]
     m, d = len(names.inputs), len(names.disturbances)
+    for i, name in enumerate(names.outputs):
+        note_suspects(name, values[:, m + d + i], numbers[grid.order], findings)
     if fill:
         values = bridged(
             grid, values, m, fill, (*names.inputs, *names.disturbances, *names.outputs), findings

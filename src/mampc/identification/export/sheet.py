@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import re
@@ -20,14 +21,18 @@ from mampc.base.files import read_bounded
 from mampc.identification.export.cell_words import without_unit
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import (
+    NOT_UTF_8,
+    REMARK,
     Row,
     find_column,
+    fitted_header,
     header_units,
     header_with,
     is_number_like,
     joined_names,
     likeliest_header,
     likelihood,
+    remarks_last,
     require_columns,
     without_empty_end,
 )
@@ -78,13 +83,14 @@ class Sheet:
         return [cell for part in parts for cell in part]
 
 
-def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
+def open_sheet(source: Any, names: Sequence[str], findings: Findings, encoding: str | None = None) -> Sheet:
     """The table in a file, or in a pandas DataFrame.
 
     Args:
         source: a path, or the frame.
         names: columns that must be there, by which the header is known; none, to take the likeliest row.
         findings: receives notes and doubts.
+        encoding: of a text; None to see it from its bytes.
 
     Raises:
         MampcError: no such file, or nothing in it that could be such a table.
@@ -96,14 +102,16 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
     content = read_bounded(source, FILE_LIMIT, KIND)
     if content.startswith(b"PAR1"):
         return frame_sheet(read_parquet(source, content), names, findings)
-    if content.startswith(b"PK\x03\x04"):
+    if content.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         worksheets = read_workbook(source, content)
         return _row_sheet([(None, rows) for rows in worksheets], names, findings)
     if content.startswith(b"\xd0\xcf\x11\xe0"):
         raise MampcError(
             f"{source}: expected a readable {KIND}, received an old Excel file; save it as .xlsx"
         )
-    encoding = _encoding(source, content, findings)
+    if content.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf")):
+        raise MampcError(f"{source}: expected a readable {KIND}, received a compressed one; unpack it first")
+    encoding = _encoding(source, content, findings) if encoding is None else _known(encoding)
 
     def parsed(separator: str) -> Rows:
         def rows() -> Iterator[list[Row]]:
@@ -122,20 +130,30 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings) -> Sheet:
     return _row_sheet([(separator, parsed(separator)) for separator in SEPARATORS], names, findings)
 
 
+def _known(encoding: str) -> str:
+    try:
+        return codecs.lookup(encoding).name
+    except (LookupError, TypeError):
+        raise MampcError(f"encoding: expected one such as 'cp932', received {shown(encoding)}") from None
+
+
 def _encoding(path: str | Path, content: bytes, findings: Findings) -> str:
     """The encoding of a text; raises `MampcError` where it is none."""
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
-    zeros = content[:2000].count(0)
+    found, zeros = "", content[:2000].count(0)
     if zeros > len(content[:2000]) / 3:  # two bytes a letter of Latin scripts, without a mark of their order
-        return "utf-16-be" if content[0] == 0 else "utf-16-le"
+        found = "utf-16-be" if content[0] == 0 else "utf-16-le"
+        content = content[:65536].decode(found, "replace").encode("latin-1", "replace")
     if BINARY.search(content[:65536]):
         raise MampcError(f"{path}: expected a readable {KIND}, received something else")
+    if found:
+        return found
     try:
         for _ in io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig"):
             pass
     except UnicodeDecodeError:
-        findings.note("text is not UTF-8: read as Windows-1252 (Western European)")
+        findings.note(NOT_UTF_8)
         return "cp1252" if not re.search(rb"[\x81\x8d\x8f\x90\x9d]", content) else "latin-1"
     return "utf-8-sig"
 
@@ -149,7 +167,7 @@ def _row_sheet(
     heads = []
     for separator, rows in readings:
         head = [(number, _stripped(row)) for number, row in next(rows(), [])[:HEAD]]
-        head = [(number, row) for number, row in head if any(row)]
+        head = remarks_last([(number, row) for number, row in head if any(row)])
         heads.append((separator, rows, head))
     if not any(head for _, _, head in heads):
         raise MampcError(
@@ -170,24 +188,28 @@ def _row_sheet(
         separator, rows, head = max(heads, key=likelihood)
         found = separator, rows, head, likeliest_header(head)
     separator, rows, head, at = found
-    above, (header_number, header_row) = at, head[at]
-    header = without_empty_end(header_row)
+    header_number, header_row = head[at]
+    first, header = header_number, without_empty_end(header_row)
     if not all(find_column(header, name) is not None for name in names or header):
         for k in (at - 1, at):
             joined = joined_names(head[k : k + 2]) if k >= 0 else None
             if joined and all(
                 find_column(joined, name) is not None for name in names or filter(None, joined)
             ):
-                above, header_number, header = k, head[k + 1][0], joined
+                first, header_number, header = head[k][0], head[k + 1][0], joined
                 findings.note(f"names of columns stand in two rows: joined, such as {shown(joined[-1])}")
                 break
+    above = sorted({number: row for number, row in head if number < first}.items())
     if above:
         findings.note(
-            f"{rows_text([number for number, _ in head[:above]])} before the header left out: "
-            f"{shown(' '.join(cell for cell in head[0][1] if cell))}"
+            f"{rows_text([number for number, _ in above])} before the header left out: "
+            f"{shown(' '.join(cell for cell in above[0][1] if cell))}"
         )
     if names:
         require_columns(header, names, findings, {cell for _, row in head[at:] for cell in row})
+    header = fitted_header(
+        header, [line for line in head if line[0] > header_number], separator, names, findings
+    )
     return _measured(rows, separator, header_number, header, names, findings)
 
 
@@ -205,6 +227,8 @@ def _measured(
     numbers = array("q")
     descriptions: list[tuple[int, list[str]]] = []
     ragged: list[tuple[int, list[str]]] = []
+    remarks: list[int] = []
+    hollow: dict[int, str] = {}  # rows with fewer fields and no number: all their values are missing
     broken: list[int] = []
     repeated: list[int] = []
     sample: list[list[str]] = []
@@ -214,6 +238,13 @@ def _measured(
         if len(row) != width:
             cells = _stripped(row)
             if not any(cells):
+                continue
+            if REMARK.match(cells[0]):
+                remarks.append(number)
+                continue
+            if len(cells) < width and numbers and not any(map(is_number_like, cells)):
+                hollow[number] = " ".join(cells).strip()
+                numbers.append(number)
                 continue
             if len(cells) < width or any(cells[width:]):
                 ragged.append((number, cells))
@@ -230,13 +261,20 @@ def _measured(
             repeated.append(number)
             continue
         numbers.append(number)
-    skipped = frozenset([*repeated, *(number for number, _ in [*descriptions, *ragged])])
-    ragged = _without_footer(ragged, numbers, findings)
+    footer: list[int] = []
+    while numbers and numbers[-1] in hollow:
+        footer.insert(0, numbers.pop())
+    if footer:
+        findings.note(f"{rows_text(footer)} after the table left out: {shown(hollow[footer[-1]])}")
+    if remarks:
+        findings.note(f"remarks behind a # in {rows_text(remarks)} left out")
+    skipped = frozenset([*repeated, *remarks, *footer, *(number for number, _ in [*descriptions, *ragged])])
+    fields = f"{width} fields, as many as names in row {header_number},"
     if len(ragged) == 1:
-        findings.doubt(f"expected {width} fields in row {ragged[0][0]}, received {len(ragged[0][1])}")
+        findings.doubt(f"expected {fields} in row {ragged[0][0]}, received {len(ragged[0][1])}")
     elif ragged:
         places = rows_text([number for number, _ in ragged])
-        findings.doubt(f"expected {width} fields in every row, received {len(ragged[0][1])} in {places}")
+        findings.doubt(f"expected {fields} in every row, received {len(ragged[0][1])} in {places}")
     if ragged and separator == "," and all(len(cells) > width for _, cells in ragged):
         findings.doubt(
             "commas may both separate fields and mark decimals: save with semicolons between fields"
@@ -259,7 +297,7 @@ def _measured(
     units = header_units(header)
     if descriptions:
         findings.note(
-            f"{rows_text([number for number, _ in descriptions])} under the header hold no numbers: "
+            f"no numbers in {rows_text([number for number, _ in descriptions])} under the header: "
             f"{shown(' | '.join(descriptions[-1][1]), 100)}"
         )
         rows_of_units = [
@@ -271,7 +309,7 @@ def _measured(
     def chunks(columns: Sequence[int]) -> Iterator[list[Cells]]:
         for block in _from(rows, header_number):
             part = [
-                row
+                row if number not in hollow else [*row, *[""] * width]
                 for number, row in block
                 if number not in skipped and (len(row) == width or any(_stripped(row)))
             ]
@@ -284,24 +322,6 @@ def _from(rows: Rows, header_number: int) -> Iterator[list[Row]]:
     """The rows under the header that are not blank."""
     for block in rows():
         yield [line for line in block if line[1] and line[0] > header_number]
-
-
-def _without_footer(
-    ragged: list[tuple[int, list[str]]], numbers: Sequence[int], findings: Findings
-) -> list[tuple[int, list[str]]]:
-    """Without the last rows where they hold one cell each, such as "594 rows exported"."""
-    footer = [
-        (number, cells)
-        for number, cells in ragged
-        if sum(map(bool, cells)) == 1
-        and not any(map(is_number_like, cells))
-        and numbers
-        and number > numbers[-1]
-    ]
-    if footer:
-        last = shown(" ".join(footer[-1][1]).strip())
-        findings.note(f"{rows_text([number for number, _ in footer])} after the table left out: {last}")
-    return [line for line in ragged if line not in footer]
 
 
 def _stripped(row: Sequence[str]) -> list[str]:

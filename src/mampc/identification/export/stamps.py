@@ -38,6 +38,7 @@ MONTH_FIRST = (
 )  # fmt: skip
 YEAR_FIRST = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d")
 PLAIN = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d{1,6})?)?", re.ASCII)
+SPAN = re.compile(r"\d+ days?,? \d+:\d\d:\d\d(\.\d+)?|(2[4-9]|[3-9]\d|\d{3,}):\d\d:\d\d(\.\d+)?", re.ASCII)
 UTC = re.compile(r" ?(UTC|GMT)$")
 HOUR = 3600.0
 
@@ -246,6 +247,17 @@ def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
         findings.doubt(f"the doubled hour at the end of summer time in {zone} cannot be told apart: {error}")
         read = known.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
     return read.reindex(stamps.index)
+
+
+def elapsed(cells: Sequence[str]) -> tuple[str, Array] | None:
+    """A span such as "30:00:00" or "1 days 06:00:00", and all of them in seconds; None where they are times of days."""
+    longest = next((cell for cell in cells if SPAN.fullmatch(cell)), None)
+    if longest is None:
+        return None
+    import pandas as pd
+
+    spans = pd.to_timedelta(pd.Series(cells, dtype=object), errors="coerce").dt.total_seconds().to_numpy()
+    return (longest, spans.astype(np.float64)) if np.isfinite(spans).mean() > 0.9 else None
 
 
 def clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Findings) -> Array:

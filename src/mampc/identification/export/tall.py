@@ -26,13 +26,16 @@ TAGS = (
     "item",
     "itemname",
     "sensor",
+    "field",
 )
 VALUES = ("value", "val", "varvalue", "wert", "valeur", "valor", "valore", "waarde")
 UNITS = ("unit", "units", "eu", "engunits", "einheit", "unité", "unidad")
 MOST_TAGS = 2000
 
 
-def open_table(source: Any, names: Sequence[str], how: TimeReading, findings: Findings) -> Sheet:
+def open_table(
+    source: Any, names: Sequence[str], how: TimeReading, findings: Findings, encoding: str | None = None
+) -> Sheet:
     """The table in a file, as `open_sheet` has it, tall ones with one column a tag.
 
     Args:
@@ -40,31 +43,34 @@ def open_table(source: Any, names: Sequence[str], how: TimeReading, findings: Fi
         names: columns that must be there; none, to take all.
         how: the time column is read.
         findings: receives notes and doubts.
+        encoding: of a text; None to see it from its bytes.
 
     Raises:
         MampcError: no such file, or nothing in it that could be such a table.
     """
     trial = Findings(findings.origin)
     try:
-        sheet = open_sheet(source, names, trial)
+        sheet = open_sheet(source, names, trial, encoding)
     except MampcError as error:
-        tall = _tall(source, names, how, findings) if trial.doubts else None
+        tall = _tall(source, names, how, findings, encoding) if trial.doubts else None
         if tall is None:
             raise error from None
         return tall
     if not names and _named(sheet.header, TAGS) is not None:
-        tall = _tall(source, names, how, findings)
+        tall = _tall(source, names, how, findings, encoding)
         if tall is not None:
             return tall
     findings.take(trial)
     return sheet
 
 
-def _tall(source: Any, names: Sequence[str], how: TimeReading, findings: Findings) -> Sheet | None:
+def _tall(
+    source: Any, names: Sequence[str], how: TimeReading, findings: Findings, encoding: str | None
+) -> Sheet | None:
     """A tall table as one with a column a tag; None where it is none."""
     trial = Findings(findings.origin)
     try:
-        sheet = open_sheet(source, (), trial)
+        sheet = open_sheet(source, (), trial, encoding)
     except MampcError:
         return None
     tags = _tag_column(sheet, names)
