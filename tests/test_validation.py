@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import mampc
 from mampc import IOData, MampcError, n4sid, validate
 from mampc.identification.validation import whiteness
 from random_systems import noise_free, noisy_record, random_system
@@ -82,3 +83,15 @@ def test_the_residuals_of_the_true_system_are_white_and_those_of_a_wrong_one_are
     data = noisy_record(system, 1)[0]
     assert (validate(system, data).whiteness > 0.01).all()
     assert (n4sid(data, order=1).validate(data).whiteness < 1e-6).all()
+
+
+def test_the_fit_to_several_records_counts_all_of_their_samples():
+    rng = np.random.default_rng(5)
+    model = mampc.StateSpace.from_first_order(
+        gain=[[2.0]], time_constant=[[50.0]], dead_time=[[0.0]], dt=10.0
+    )
+    u = np.concatenate([np.zeros(40), np.repeat(rng.choice([-1.0, 1.0], 60), 5)])[:, None]
+    y = model.response(u) + 0.05 * rng.standard_normal((len(u), 1))
+    whole = mampc.n4sid(mampc.IOData(u, y, 10.0), order=1)
+    pieces = mampc.n4sid([mampc.IOData(u[:40], y[:40], 10.0), mampc.IOData(u[40:], y[40:], 10.0)], order=1)
+    np.testing.assert_allclose(pieces.fit, whole.fit, atol=3.0)

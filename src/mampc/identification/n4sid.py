@@ -20,7 +20,7 @@ from mampc.identification.parts import Part, assembled, part_residuals
 from mampc.identification.scaling import Scaled, scaled
 from mampc.identification.subspace import WEIGHTINGS
 from mampc.identification.uncertainty import jackknife
-from mampc.identification.validation import Validation, validate
+from mampc.identification.validation import Validation, fit_to_all, validate
 from mampc.systems.noise import Noise
 from mampc.systems.state_space import StateSpace
 
@@ -46,7 +46,7 @@ class Identified:
             shift registers among the model's states.
         detrend: what was done about drifts, one of "none", "constant", "linear", "differences", "whitened".
         notes: what was found and decided, in sentences.
-        fit: percent per output, shape (l,), of the simulated model on the (first) record itself, a line in
+        fit: percent per output, shape (l,), of the simulated model on the records themselves, a line in
             time set aside unless `detrend` is "none" or "constant".
         stabilised: True if poles were moved inside the unit circle.
     """
@@ -157,7 +157,8 @@ def n4sid(
     notes = list(choice.notes)
     if integrators:
         notes.append(f"Poles that the record cannot tell from one were made exactly one: {integrators}.")
-    quality = validate(model, first, drift=choice.trend not in ("none", "constant"))
+    drift = choice.trend not in ("none", "constant")
+    quality = validate(model, first, drift=drift)
     return Identified(
         model=model,
         x0=quality.x0,
@@ -167,7 +168,7 @@ def n4sid(
         delays=choice.delays,
         detrend=choice.trend,
         notes=tuple(notes),
-        fit=quality.fit,
+        fit=quality.fit if len(given) == 1 else fit_to_all(model, given, drift=drift),
         stabilised=any(part.stabilised for part in parts),
         _estimate=_Estimate(records, settings, choice, tuple(len(part.A) for part in parts), first),
     )

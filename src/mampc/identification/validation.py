@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,15 +66,27 @@ def validate(model: StateSpace, data: IOData, *, drift: bool = False) -> Validat
         x0, line = initial_state(model, data, drift=drift)
         y_hat = model.response(data.u, x0) + line
     residuals = data.y - y_hat
+    return Validation(fit(_about_lines(data, y_hat, drift)), y_hat, residuals, x0, whiteness(residuals))
+
+
+def fit_to_all(model: StateSpace, records: Sequence[IOData], *, drift: bool = False) -> Array:
+    """The fit to several records taken together, each with its own initial state, shape (l,)."""
+    return fit(*(_about_lines(data, validate(model, data, drift=drift).y_hat, drift) for data in records))
+
+
+def _about_lines(data: IOData, y_hat: Array, drift: bool) -> tuple[Array, Array]:
     own = _lines(len(data)) if drift else np.empty((len(data), 0))
     level = own @ (own.T @ data.y)
-    return Validation(fit(data.y - level, y_hat - level), y_hat, residuals, x0, whiteness(residuals))
+    return data.y - level, y_hat - level
 
 
-def fit(y: Array, y_hat: Array) -> Array:
-    """100 (1 - |y - y_hat| / |y - mean(y)|) in percent per output; 100 for a constant matched exactly."""
-    error = np.linalg.norm(y - y_hat, axis=0)
-    spread = np.linalg.norm(y - y.mean(axis=0), axis=0)
+def fit(*pairs: tuple[Array, Array]) -> Array:
+    """100 (1 - |y - y_hat| / |y - mean(y)|) in percent per output, of one record or several, each about its own mean.
+
+    100 for a constant matched exactly.
+    """
+    error = np.sqrt(sum(np.sum((y - y_hat) ** 2, axis=0) for y, y_hat in pairs))
+    spread = np.sqrt(sum(np.sum((y - y.mean(axis=0)) ** 2, axis=0) for y, _ in pairs))
     with np.errstate(divide="ignore", invalid="ignore"):
         percent: Array = 100 * (1 - np.where(error == 0, 0.0, error / spread))
     return percent

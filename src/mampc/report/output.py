@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,10 @@ def trajectories(study: Study) -> Iterator[tuple[str, str, str]]:
 
 def save_figure(figure: Any, stem: Path) -> None:
     """Write a figure as PNG and SVG, each whole, `stem` being the path without its ending."""
-    with styled():
+    with styled(), warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", "Glyph .* missing"
+        )  # letters that matplotlib's font lacks are boxes
         for kind in FIGURE_KINDS:
             with written_whole(stem.with_name(f"{stem.name}.{kind}")) as unfinished:
                 figure.savefig(unfinished, format=kind, metadata={"Date": None} if kind == "svg" else None)
