@@ -8,8 +8,8 @@
 
 A first-order plant, its model exact (or the quadruple tank as identified, or the level as linearised, which
 integrates), with measurement noise sigma and loads at its output that jump at random. Outputs are to be within
-two sigma of their reference. Set point, zones of that width and of half of it, each with a price per move, over
-the same seeds; the price goes through the values of `PRICES`.
+two sigma of their reference. Set point, zone of that width, and the same with a pull to the middle, each with a
+price per move, over the same seeds; the price goes through the values of `PRICES`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ import mampc
 from measuring import closed_loop, interleaved, steps_of, tank_problem
 
 SIGMA = 0.1
-PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
+PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
+PULL = 0.1
 SEEDS = 40
 STEPS = 200
 LOAD = mampc.loads.RandomSteps(at="output", size=0.5, every=60.0)
@@ -73,11 +74,11 @@ def case(name: str) -> Case:
     return Case(model, model, SIGMA, LOAD, mampc.Limits(u_min=-10.0, u_max=10.0), SEEDS)
 
 
-def outcome(of: Case, name: str, price: float, width: float, kalman: bool) -> Outcome:
+def outcome(of: Case, name: str, price: float, width: float, pull: float, kalman: bool) -> Outcome:
     """One controller over all seeds, with a zone of so many sigma, at a price in units of a hundred sigma squared."""
     problem = mampc.TrackingProblem(
         of.model, prediction_horizon=of.horizon, control_horizon=3, tail_horizon=of.horizon, limits=of.limits,
-        move_weight=of.move_weight, zone_below=width * of.sigma, zone_above=width * of.sigma,
+        move_weight=of.move_weight, zone_below=width * of.sigma, zone_above=width * of.sigma, zone_pull=pull,
     )  # fmt: skip
     rules = mampc.MoveRules(price=100 * price * of.sigma**2)
     estimator = mampc.KalmanFilter.offset_free(of.model) if kalman else None
@@ -145,11 +146,11 @@ def main() -> None:
     if arguments.times:
         times()
         return
-    kinds = {"set point": 0.0, "zone of two sigma": 2.0, "zone of one sigma": 1.0}
+    kinds = {"set point": (0.0, 0.0), "zone": (2.0, 0.0), f"zone with a pull of {PULL:g}": (2.0, PULL)}
     of = case(arguments.plant)
     every = [(name, price) for name in kinds for price in PRICES]
     found = [
-        outcome(of, name, price, kinds[name], arguments.kalman)
+        outcome(of, name, price, *kinds[name], arguments.kalman)
         for name, price in track(every, "zones", console=Console(stderr=True))
     ]
     fronts = {name: [o for o in found if o.name == name] for name in kinds}

@@ -96,8 +96,11 @@ def cost_of(problem, x, u_previous, reference, plan, input_disturbance=0.0, outp
     ranked = problem.output_weight * np.sqrt(
         np.outer(*[np.where(problem.zoned, problem.rank_weights, 1.0)] * 2)
     )
+    away = y - aims(problem, y, reference)
+    drawn = np.where(problem.zoned, problem.zone_pull, 0.0) * np.diag(ranked) * (away**2 - error**2)
     return (
         np.einsum("ia,ab,ib", error, ranked, error)
+        + drawn.sum()
         + np.einsum("ja,ab,jb", weighed, problem.move_weight, weighed)
         + np.sum(problem.output_limit_weights * (scaled + scaled**2 / 2))
         + cost_of_inputs(problem, plan[np.minimum(np.arange(n_p + 1), len(plan) - 1)])
@@ -111,6 +114,19 @@ def distance(problem, y, reference):
     else:
         low, high = reference - problem.zone_below, reference + problem.zone_above
     return y - np.clip(y, np.broadcast_to(low, y.shape), np.broadcast_to(high, y.shape))
+
+
+def aims(problem, y, reference):
+    """What a `zone_pull` draws outputs (T, l) to: references, the middle of a `Zone`, or inside its only end."""
+    if not isinstance(reference, mampc.Zone):
+        return np.broadcast_to(reference, y.shape)
+    inside = [np.where(np.isfinite(a), a, np.where(np.isfinite(b), b, 0.0)) for a, b in (
+        (problem.zone_below, problem.zone_above), (problem.zone_above, problem.zone_below)
+    )]  # fmt: skip
+    low, high = (np.broadcast_to(end, y.shape) for end in (reference.low, reference.high))
+    one_sided = np.clip(y, low + inside[0], np.maximum(high - inside[1], low + inside[0]))
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(low) & np.isfinite(high), (low + high) / 2, one_sided)
 
 
 def cost_of_inputs(problem, u):

@@ -117,7 +117,7 @@ def program_of(problem, x, u_previous, reference):
     zoned = np.tile((problem.zone_below > 0) | (problem.zone_above > 0), n_p + 1)
     q = np.tile(np.diag(problem.output_weight), n_p + 1)
     Q, R = np.kron(np.eye(n_p + 1), problem.output_weight), np.kron(np.eye(n_c), problem.move_weight)
-    Q[zoned] = 0.0
+    Q[zoned] *= problem.zone_pull
     error = (np.broadcast_to(reference, free.shape) - free).ravel()
     scale, w = violation_scale(problem), problem.output_limit_weight
     H = np.zeros((l + n, l + n))
@@ -147,8 +147,9 @@ def program_of(problem, x, u_previous, reference):
     rows, bounds = rows[limited], bounds[limited]
     if zoned.any():  # an error of either sign for each value, between the violations and the moves
         k = int(zoned.sum())
+        of_zones = np.diag(2 * (1 - problem.zone_pull) * q[zoned])
         H = np.block([
-            [H[:l, :l], np.zeros((l, k)), H[:l, l:]], [np.zeros((k, l)), np.diag(2 * q[zoned]), np.zeros((k, n))],
+            [H[:l, :l], np.zeros((l, k)), H[:l, l:]], [np.zeros((k, l)), of_zones, np.zeros((k, n))],
             [H[l:, :l], np.zeros((n, k)), H[l:, l:]],
         ])  # fmt: skip
         f = np.concatenate([f[:l], np.zeros(k), f[l:]])

@@ -324,6 +324,7 @@ def test_what_the_template_shows_in_comments_can_be_said():
     for key in (
         "zone_below",
         "zone_above",
+        "zone_pull",
         "output_rank",
         "u_target",
         "u_target_weight",

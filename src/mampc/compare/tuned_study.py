@@ -139,6 +139,7 @@ def _problem(tuned: Tuned) -> ProblemTable:
         u_target=None if problem.u_target is None else problem.u_target.tolist(),
         u_target_weight=_weight(problem.u_target_weight), u_cost=problem.u_cost.tolist(),
         zone_below=problem.zone_below.tolist(), zone_above=problem.zone_above.tolist(),
+        zone_pull=problem.zone_pull,
         output_rank=None if problem.output_rank is None else problem.output_rank.tolist(),
     )  # fmt: skip
 

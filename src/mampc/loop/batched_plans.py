@@ -310,7 +310,8 @@ def _plans_of_bank(bank: ControllerBank, preview: bool) -> BatchedPlans | None:
     first, found = bank.problem, dict[str, BatchedPlans]()
     for name, controller in bank.variants.items():
         own = controller.problem
-        alike = (own.zone_below == first.zone_below).all() and (own.zone_above == first.zone_above).all()
+        names = ("zone_below", "zone_above", "zone_pull")
+        alike = all(np.array_equal(getattr(own, name), getattr(first, name)) for name in names)
         plans = _plans_of(controller, preview, None) if alike else None
         if plans is None:
             return None

@@ -16,6 +16,7 @@ import numpy as np
 
 from mampc.base.checks import Array, as_shaped
 from mampc.program.problem import TrackingProblem
+from mampc.program.sample import Indices
 from mampc.program.zone import Zone, ZoneEnds
 
 
@@ -33,6 +34,7 @@ class Parameter:
         references: where r_0 .. r_np stand, the lower ends of zones among them, ((np + 1) l,).
         final_reference: the last l of `references`.
         lower_ends, upper_ends: where those of zoned outputs stand, sample by sample.
+        lower_aims, upper_aims: the same of what they are drawn to; empty where they are not.
         size: of p.
         origin: what is subtracted from engineering units, by the length of p.
     """
@@ -40,10 +42,10 @@ class Parameter:
     def __init__(self, problem: TrackingProblem) -> None:
         model = problem.model
         m, l, zoned = model.n_inputs, model.n_outputs, np.flatnonzero(problem.zoned)
-        samples, width = problem.prediction_horizon + 1, l + len(zoned)
-        self._samples, self._width = samples, width
         self._problem = problem
         self._ends = ZoneEnds(problem) if len(zoned) else None
+        samples, width = problem.prediction_horizon + 1, l if self._ends is None else self._ends.width
+        self._samples, self._width = samples, width
         sizes = [model.n_states, m, m, m, l, len(model.v_op), 1, samples * width]
         ends = np.cumsum(sizes).tolist()
         (
@@ -53,10 +55,17 @@ class Parameter:
         self.size = ends[-1]
         at = self.reference.start + np.arange(samples * width).reshape(samples, width)
         self.references, self.final_reference = at[:, :l].ravel(), at[-1, :l]
-        self.lower_ends, self.upper_ends = at[:, zoned].ravel(), at[:, l:].ravel()
+        more: list[Indices] = [
+            part.ravel() for part in np.split(at[:, l:], max((width - l) // max(len(zoned), 1), 1), axis=1)
+        ]
+        self.lower_ends, self.upper_ends = at[:, zoned].ravel(), more[0]
+        none: Indices = np.zeros(0, dtype=np.intp)
+        self.lower_aims, self.upper_aims = more[1:] if len(more) > 1 else (none, none)
         origin = np.zeros(self.size)
         origin[self.u_deviation], origin[self.measured_disturbance] = model.u_op, model.v_op
-        origin[self.reference] = np.tile(np.concatenate([model.y_op, model.y_op[zoned]]), samples)
+        origin[self.reference] = np.tile(
+            np.concatenate([model.y_op, *[model.y_op[zoned]] * len(more)]), samples
+        )
         self.origin = {len(of): of for of in (origin, origin[: self.reference.start + width])}
         usual = np.zeros(self.size)  # no disturbances, and the measured ones of the operating point
         usual[self.measured_disturbance], usual[self.one] = model.v_op, 1.0
@@ -100,7 +109,7 @@ class Parameter:
         return vector
 
     def with_ends(self, reference: Array) -> Array:
-        """What stands in p for references of shape (..., l): with zones their ends, shape (..., l + zoned)."""
+        """What stands in p for references of shape (..., l): with zones their ends, (..., width of `ZoneEnds`)."""
         if self._ends is None or reference.shape[-1] == self._width:
             return reference
         return self._ends.about(reference)
@@ -110,7 +119,7 @@ class Parameter:
         return (ZoneEnds(self._problem) if self._ends is None else self._ends).of(zone)
 
     def of_zones(self, zone: Zone) -> Array:
-        """The same for any number of samples, shape (T, l + zoned)."""
+        """The same for any number of samples, shape (T, width of `ZoneEnds`)."""
         return (ZoneEnds(self._problem) if self._ends is None else self._ends).of_rows(zone)
 
     def no_map(self, rows: int) -> Array:

@@ -124,6 +124,9 @@ class TrackingProblem:
             scalar or one per output, infinite for no end at that side; 0 and 0 (the default) for a set point. The
             reference moves the zone; `Zone` gives another one for a sample. Outputs with a zone need an output_weight
             without products with others.
+        zone_pull: share of its weight, 0 <= zone_pull < 1, with which an output with a zone is drawn to its reference,
+            inside too: q ((1 - pull) dist^2 + pull (y - r)^2); of a `Zone` to its middle. A little of it (0.03) lets
+            moves that have a price go to the middle once they are made, and not to the edge.
 
     Raises:
         MampcError: anything that does not fit the model or the horizons.
@@ -143,6 +146,7 @@ class TrackingProblem:
     u_cost: Any = field(default=0.0, kw_only=True)
     zone_below: Any = field(default=0.0, kw_only=True)
     zone_above: Any = field(default=0.0, kw_only=True)
+    zone_pull: float = field(default=0.0, kw_only=True)
     output_rank: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -183,6 +187,7 @@ class TrackingProblem:
             "u_cost": as_vector("u_cost", self.u_cost, m),
             "zone_below": as_limit("zone_below", self.zone_below, l, np.inf),
             "zone_above": as_limit("zone_above", self.zone_above, l, np.inf),
+            "zone_pull": as_number("zone_pull", self.zone_pull, 0.0),
         }.items():
             object.__setattr__(self, name, value)
         self._check_input_cost()
@@ -243,6 +248,10 @@ class TrackingProblem:
             width = getattr(self, name)
             if (width < 0).any():
                 raise MampcError(f"{name}: expected at least 0, received {width}")
+        if not self.zone_pull < 1:
+            raise MampcError(
+                f"zone_pull: expected a share below 1, where zones are set points, received {self.zone_pull:g}"
+            )
         zoned = self.zoned
         off_diagonal = self.output_weight - np.diag(np.diag(self.output_weight))
         if off_diagonal[zoned].any():

@@ -4,6 +4,7 @@
 
 over predicted values g_k of zoned outputs: at the samples i = 0..np, and with a tail its means over the samples np + 1,
 np + 2..3, np + 4..7 and so on, each weighted as much as the tail weighs its samples.
+With a pull a each g_k counts twice: at (1 - a) q_k with its zone, and at a q_k with what it is drawn to.
 In the program each g_k has an error s_k of either sign, low_k <= g_k - s_k <= high_k, which costs q_k s_k^2.
 """
 
@@ -15,6 +16,7 @@ from mampc.base.checks import Array
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
+from mampc.program.sample import Indices
 from mampc.program.tail import beyond_horizon, end_of_horizon, shrink
 
 LONGEST = 4  # tail horizons, from which on one mean stands for all samples
@@ -36,19 +38,36 @@ class ZoneRows:
         theta, free = prediction.theta[rows], prediction.free[rows]
         own = np.diag(problem.output_weight)[zoned] * problem.rank_weights[zoned]
         weight = np.tile(own, n_p + 1)
-        low, high = np.zeros((2, len(free), parameter.size))
-        low[:, parameter.lower_ends] = np.eye(len(free))
-        high[:, parameter.upper_ends] = np.eye(len(free))
+        low, high = (_ends_at(of, parameter) for of in (parameter.lower_ends, parameter.upper_ends))
+        pull = problem.zone_pull
+        aims = (
+            [_ends_at(of, parameter) for of in (parameter.lower_aims, parameter.upper_aims)]
+            if pull > 0
+            else []
+        )
         if problem.tail_horizon > 0 and zoned.any():
             means, of_moves, weights = _tail_means(problem, prediction, parameter)
             last, pieces = int(zoned.sum()), len(weights)
             theta, free = np.vstack([theta, of_moves]), np.vstack([free, means])
-            low = np.vstack([low, np.tile(low[len(low) - last :], (pieces, 1))])
-            high = np.vstack([high, np.tile(high[len(high) - last :], (pieces, 1))])
+            low, high, *aims = (
+                np.vstack([ends, np.tile(ends[len(ends) - last :], (pieces, 1))])
+                for ends in (low, high, *aims)
+            )
             weight = np.concatenate([weight, np.outer(weights, own).ravel()])
+        if aims:
+            theta, free = np.vstack([theta, theta]), np.vstack([free, free])
+            low, high = np.vstack([low, aims[0]]), np.vstack([high, aims[1]])
+            weight = np.concatenate([(1 - pull) * weight, pull * weight])
         self.theta, self.root = theta, np.sqrt(weight)
         self.low, self.high = low - free, high - free
         self.weighted_free = self.root[:, None] * free
+
+
+def _ends_at(places: Indices, parameter: Parameter) -> Array:
+    """Ends that stand at these places of p, as maps of it."""
+    ends = parameter.no_map(len(places))
+    ends[np.arange(len(places)), places] = 1.0
+    return ends
 
 
 def _tail_means(

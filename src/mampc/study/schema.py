@@ -101,6 +101,7 @@ class ProblemTable(Table):
     u_cost: Values = 0.0
     zone_below: Widths = 0.0
     zone_above: Widths = 0.0
+    zone_pull: Annotated[float, Field(ge=0, lt=1)] = 0.0
     output_rank: Count | list[Count] | None = None
 
 
