@@ -106,20 +106,20 @@ def draw(fronts: dict[str, list[Outcome]]) -> None:
     """Both fronts in one figure."""
     import matplotlib.pyplot as plt
 
-    from mampc.base.drawing import styled
+    from mampc.base.drawing import BLUE, GREEN, VERMILION, styled
 
     with styled():
         figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-        for name, outcomes in fronts.items():
+        for (name, outcomes), color in zip(fronts.items(), (BLUE, VERMILION, GREEN), strict=True):
             axes.errorbar(
                 [100 * o.outside for o in outcomes], [o.moves for o in outcomes],
-                xerr=[100 * o.error for o in outcomes], marker="o", label=name,
+                xerr=[100 * o.error for o in outcomes], marker="o", color=color, label=name,
             )  # fmt: skip
         axes.set(xlabel="time outside two sigma, %", ylabel=f"moves in {STEPS} samples", yscale="log")
         axes.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
         axes.minorticks_off()
-        axes.legend(frameon=False)
-        figure.savefig(FIGURE)
+        axes.legend()
+        figure.savefig(FIGURE, metadata={"Date": None})
 
 
 def times() -> None:

@@ -66,18 +66,12 @@ def example_figures():
             for (top, bottom), controller in zip(axes.T, controllers, strict=True):
                 run = runs[controller]
                 minutes = run.t / 60.0
-                top.step(
-                    minutes,
-                    run.r[:, 0],
-                    where="post",
-                    color=BLACK,
-                    linestyle="--",
-                    linewidth=0.9,
-                    label="reference",
-                )
+                dashed(top, run, 0)
                 top.plot(minutes, run.y[:, 0], color=BLUE, label="output")
                 if not np.array_equal(run.position, run.u):
-                    bottom.step(minutes, run.position[:, 0], where="post", color=ORANGE, label="valve")
+                    bottom.step(
+                        minutes, run.position[:, 0], where="post", color=GREY, linewidth=2.2, label="valve"
+                    )
                 bottom.step(minutes, run.u[:, 0], where="post", color=VERMILION, label="input", linewidth=0.9)
                 top.set_title(controller)
                 bottom.set_xlabel("min")

@@ -146,8 +146,9 @@ def identify(
             help="none, constant, linear, differences or whitened; auto takes what predicts held-out data best."
         ),
     ] = "auto",
-    share: Annotated[float, typer.Option(help="Part of the record to estimate on; the rest validates.")] = 2
-    / 3,
+    share: Annotated[
+        float, typer.Option(help="Part of the record to estimate on; the rest validates.", show_default="2/3")
+    ] = 2 / 3,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Model file; default the first file's name with .json.")
     ] = None,
