@@ -121,8 +121,8 @@ class DaqpSolver:
 
         f is no longer than ORDINARY.
         """
-        model, apart = getattr(self._local, "model", None), lower <= upper
-        if model is None or self._units is not None or not apart[apart.argmin()]:
+        model = getattr(self._local, "model", None)
+        if model is None or self._units is not None:
             self.start(active)
             return self.solve(f, lower, upper)
         sense = self._inactive if active is None else _there(active, lower, upper)

@@ -11,7 +11,7 @@ of the optimum is a sum of squares.
 from __future__ import annotations
 
 from functools import cached_property
-from math import frexp, isfinite
+from math import frexp, isfinite, ldexp
 from typing import NamedTuple
 
 import numpy as np
@@ -132,7 +132,7 @@ class LeastDistance:
         scale, f, even = 1.0, self._f, self.even
         # Violations of limits have a size of their own, 1: nothing smaller is enlarged then.
         if far > (1.0 if limited else 0.0) and isfinite(far):
-            scale = float(2.0 ** frexp(far)[1])
+            scale = ldexp(1.0, frexp(far)[1])
             f, even = self._scaled(scale)
             scaled = distances / scale
             low, high = scaled[:size], scaled[size:]
@@ -235,7 +235,6 @@ class LeastDistance:
 
     def _far(self, low: Array, high: Array) -> float:
         """How far the optimum is from what it should keep; not above zero where it keeps all bounds."""
-        if len(low) == self._v:
+        if len(low) == self._v:  # no bounds but those of the violations, which begin at zero
             return 0.0
-        low, high = low[self._v :], high[self._v :]
         return max(float(low[low.argmax()]), -float(high[high.argmin()]))

@@ -102,25 +102,25 @@ class Restriction:
         """
         k = len(self.moves)
         of_target, which, even = self._of_sample
-        values, given = of_target.dot(target), bounds.take(which)
+        values, given = of_target.dot(target), bounds if which is None else bounds.take(which)
         missed, distances = values[k : len(target)], given * even
         distances -= values[len(target) :]
-        excess = float(missed.dot(missed))
+        excess = float(missed.dot(missed)) if len(missed) else 0.0
         nearest = self.program.solve_at(
             values[:k], distances, given, None if active is None else active[self.bounds], cutoff - excess
         )
         return self._of_all_bounds(nearest, excess)
 
     @cached_property
-    def _of_sample(self) -> tuple[Array, Indices, Array]:
-        """What `nearest` needs: optimum, missed and twice the even rows per target; which bounds; their factors."""
-        even = self.program.even
+    def _of_sample(self) -> tuple[Array, Indices | None, Array]:
+        """What `nearest` needs: optimum, missed, twice the even rows per target; which bounds, if not all; factors."""
+        even, every = self.program.even, len(self.bounds) == self._n_bounds
         rows = np.vstack(
             [np.zeros((self.n_violations, len(self.missed.T))), self.program.even_rows @ self._optimum]
         )
         return (
             np.vstack([self._optimum, self.missed, rows, rows]),
-            np.concatenate([self.bounds, self._n_bounds + self.bounds]),
+            None if every else np.concatenate([self.bounds, self._n_bounds + self.bounds]),
             np.concatenate([even, even]),
         )
 

@@ -45,13 +45,14 @@ class Optimum:
     """One sample's optimum without limits on some pattern, as views into one array.
 
     How far it stays from each bound (negative where it breaks one), its moves d, its inputs
-    u_0 .. u_{nc-1}, and a vector whose squared length is its cost (where inputs have a price, up to one number).
+    u_0 .. u_{nc-1}, and its cost: the squared length of a residual and, where inputs have a price, one number more.
     """
 
-    __slots__ = ("_margins", "data", "parts")
+    __slots__ = ("_margins", "cost", "data", "parts")
 
     def __init__(self, data: Array, parts: Parts, margins: Array | None = None) -> None:
         self.data, self.parts, self._margins = data, parts, margins
+        self.cost = _cost(data, parts)
 
     @property
     def margins(self) -> Array:
@@ -65,11 +66,11 @@ class Optimum:
     def inputs(self) -> Array:
         return self.data[self.parts.inputs]
 
-    @property
-    def cost(self) -> float:
-        residual, price = self.data[self.parts.residual], self.parts.price
-        cost = float(residual.dot(residual))
-        return cost if price is None else cost + float(self.data[price])
+
+def _cost(data: Array, parts: Parts) -> float:
+    residual, price = data[parts.residual], parts.price
+    cost = float(residual.dot(residual))
+    return cost if price is None else cost + float(data[price])
 
 
 class LaterData(Protocol):
@@ -93,7 +94,6 @@ class Sample(Optimum):
 
     __slots__ = (
         "_constant",
-        "_cost",
         "bounds_now",
         "distances",
         "frozen",
@@ -116,18 +116,12 @@ class Sample(Optimum):
         self.later_data: LaterData | None = None
         self._margins: Array | None = None
         self._constant: float | None = None
-        self._cost: float | None = None
+        self.cost = _cost(data, parts)
         self.distances: tuple[Array, Array] | None = None
         if bounds_now is not None:
             data[parts.lower], data[parts.upper] = bounds_now.lower, bounds_now.upper
             self._margins = bounds_now.margins(data[parts.moves])
         data.setflags(write=False)  # and with it every view that is handed out
-
-    @property
-    def cost(self) -> float:
-        if self._cost is None:
-            self._cost = super().cost
-        return self._cost
 
     @property
     def target(self) -> Array:
