@@ -8,8 +8,8 @@
 
 A first-order plant, its model exact (or the quadruple tank as identified, or the level as linearised, which
 integrates), with measurement noise sigma and loads at its output that jump at random. Outputs are to be within
-two sigma of their reference. Set point, zone of that width, and the same with a pull to the middle, each with a
-price per move, over the same seeds; the price goes through the values of `PRICES`.
+two sigma of their reference. Set point, zone of that width, the same with a pull to the middle, and one of half the
+width with it, each with a price per move, over the same seeds; the price goes through the values of `PRICES`.
 """
 
 from __future__ import annotations
@@ -146,7 +146,10 @@ def main() -> None:
     if arguments.times:
         times()
         return
-    kinds = {"set point": (0.0, 0.0), "zone": (2.0, 0.0), f"zone with a pull of {PULL:g}": (2.0, PULL)}
+    kinds = {
+        "set point": (0.0, 0.0), "zone of two sigma": (2.0, 0.0), f"with a pull of {PULL:g}": (2.0, PULL),
+        f"zone of one sigma, pull {PULL:g}": (1.0, PULL),
+    }  # fmt: skip
     of = case(arguments.plant)
     every = [(name, price) for name in kinds for price in PRICES]
     found = [

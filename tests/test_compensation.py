@@ -7,6 +7,7 @@ import pytest
 
 import mampc
 from builders import same_decision, tank_model, tank_problem
+from mampc.study import parse_study, run_study
 from referees import moved
 from seeds import examples
 
@@ -124,6 +125,29 @@ def test_a_run_replays_and_comes_out_the_same_among_many():
     assert same_decision(regulator.step(kept, y, y - 1.0), regulator.step(decision.state, y, y - 1.0), atol=0)
 
 
+def test_variants_of_a_bank_are_compensated_alike_each_within_its_limits():
+    valves = mampc.Valves(band=4.0, jump=1.0)
+    narrow = tank_problem(
+        MODEL, tail_horizon=10.0, limits=mampc.Limits(u_min=MODEL.u_op - 2.0, u_max=MODEL.u_op + 2.0)
+    )
+    rules = mampc.MoveRules(price=0.1, min_size=1.05)
+    wide = replace(narrow, limits=PROBLEM.limits)
+    bank = mampc.ControllerBank({"narrow": mampc.MAMPC(narrow, rules), "wide": mampc.MAMPC(wide, rules)})
+    regulator = mampc.Regulator(bank, valves=valves)
+    names = ["narrow"] * 10 + ["wide"] * 10 + ["narrow"] * 10
+    reference = mampc.steps(30, MODEL.y_op, [(2, MODEL.y_op + 4.0)])
+    run = mampc.simulate(MODEL, regulator, reference, valves=valves, variant=names)
+    planned = np.array([decision.plan[0] for decision in run.decisions])
+    apart = np.abs(run.u - MODEL.u_op).max(axis=1)
+    assert (apart[:10] <= 2.0).all()
+    assert (apart[10:20] > 2.0).any()
+    np.testing.assert_allclose(run.position[10:20], planned[10:20], atol=1e-9)
+    with pytest.raises(mampc.MampcError, match="or a bank of them, received MPC"):
+        mampc.Regulator(
+            mampc.ControllerBank({"own": mampc.MAMPC(wide, rules), "plain": mampc.MPC(wide)}), valves=valves
+        )
+
+
 def test_what_valves_would_not_execute_is_refused():
     valves = mampc.Valves(band=2.0, jump=1.0)
     with pytest.raises(mampc.MampcError, match="min_size above the jump"):
@@ -158,3 +182,48 @@ def test_whatever_comes_inputs_stay_within_their_limits_and_states_go_to_text_an
         assert (decision.u <= high).all()
         state = decision.state
         assert regulator.state_from_json(state.to_json()).to_json() == state.to_json()
+
+
+BANK = """
+name = "bank"
+steps = 12
+dt = 10.0
+plant = { kind = "model" }
+model = { file = "model.json" }
+actuators = { band = 2.0, jump = 1.0 }
+[problem]
+prediction_horizon = 8
+control_horizon = 2
+limits = { u_min = 0.0, u_max = 100.0 }
+[reference]
+initial = [0.0, 0.0]
+changes = [{ at = 2, value = [2.0, 2.0] }]
+[[scenarios]]
+name = "one"
+valves = { band = 2.0, jump = 1.0 }
+switches = [{ at = 4, variant = "brisk" }]
+[[controllers]]
+name = "calm"
+method = "exact"
+rules = { price = 1.0 }
+[[controllers]]
+name = "brisk"
+method = "exact"
+rules = { price = 0.1 }
+[[controllers]]
+name = "both"
+method = "bank"
+variants = ["calm", "brisk"]
+compensate = true
+"""
+
+
+def test_a_study_compensates_the_valves_of_a_bank(tmp_path):
+    MODEL.save(tmp_path / "model.json")
+    run = run_study(parse_study(BANK, folder=tmp_path)).runs["one"]["both"]
+    np.testing.assert_allclose(run.position, [decision.plan[0] for decision in run.decisions], atol=1e-9)
+    text = BANK.replace(
+        'name = "calm"\nmethod = "exact"\nrules = { price = 1.0 }', 'name = "calm"\nmethod = "mpc"'
+    )
+    with pytest.raises(mampc.StudyError, match="'calm': compensate: expected rules"):
+        run_study(parse_study(text, folder=tmp_path))

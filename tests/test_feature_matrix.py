@@ -70,7 +70,8 @@ def made(feature, place, method="exact", **settings):
     if place == "rules around":
         controller = mampc.rivals.DeadBand(controller, size=0.2)
     if feature == "bank" or place == "variant":
-        controller = mampc.ControllerBank({"own": controller, "plain": mampc.MPC(own)})
+        other = mampc.MAMPC(own, rules(feature)) if feature == "valves" else mampc.MPC(own)
+        controller = mampc.ControllerBank({"own": controller, "plain": other})
     if feature == "reference filter":
         loop["reference_filter"] = mampc.ReferenceFilter(time_constant=2.0, rate=0.5)
     if feature == "valves":

@@ -272,8 +272,11 @@ class Regulator:
         command, positions, memory = None, decision.u, decision.state
         if self._compensation is not None and state.command is not None:
             last = state.command if in_manual is None else np.where(in_manual, u_previous, state.command)
+            deciding = self._planner
+            if isinstance(deciding, ControllerBank):
+                deciding = deciding.variants[variant or deciding.usual]
             command, positions = self._compensation.decided(
-                positions, u_previous, last, *self._planner.range_now(limits)
+                positions, u_previous, last, *deciding.range_now(limits)
             )
             memory = memory._replace(inputs=np.concatenate((memory.inputs[:-1], positions[None])))
             decision = decision._replace(u=command)
@@ -328,16 +331,17 @@ class Regulator:
 def _compensation(valves: Valves, controller: Controller) -> Compensation:
     """That of a controller's valves; raises `MampcError` where its moves are not executed."""
     compensation = Compensation(as_instance("valves", valves, Valves), controller.problem.model.n_inputs)
-    if type(controller) is not MAMPC or controller.levels is not None:
-        raise MampcError(
-            f"valves: expected a MAMPC of inputs without levels, received {type(controller).__name__}"
-        )
-    size = as_vector("min_size", controller.rules.min_size, controller.problem.model.n_inputs)
-    if ((size <= compensation.jump) & (compensation.jump > 0)).any():
-        raise MampcError(
-            f"valves: expected rules with a min_size above the jump of {compensation.jump}, since smaller moves are "
-            f"not executed, received {size}"
-        )
+    for one in controller.each:
+        if type(one) is not MAMPC or one.levels is not None:
+            raise MampcError(
+                f"valves: expected a MAMPC of inputs without levels, or a bank of them, received {type(one).__name__}"
+            )
+        size = as_vector("min_size", one.rules.min_size, controller.problem.model.n_inputs)
+        if ((size <= compensation.jump) & (compensation.jump > 0)).any():
+            raise MampcError(
+                f"valves: expected rules with a min_size above the jump of {compensation.jump}, since smaller moves "
+                f"are not executed, received {size}"
+            )
     return compensation
 
 

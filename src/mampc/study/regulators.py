@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import as_vector
-from mampc.base.errors import said_at
+from mampc.base.errors import MampcError, said_at
 from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.loop.defaults import default_estimator
@@ -29,11 +29,15 @@ EXECUTED = 1.05  # of what a valve does not answer: the least move, since nobody
 def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
     """The regulator that a study's tables describe."""
     problem = problem_of(study, model)
-    valves = None
+    valves, tables = None, study.controllers
     if table.compensate and study.actuators is not None:
         valves = study.actuators.valves()
-        table = _executed(table, valves, model.n_inputs)
-    controller = _controller(problem, table, study.controllers)
+        names = table.variants or [table.name]
+        tables = [
+            _executed(other, valves, model.n_inputs) if other.name in names else other for other in tables
+        ]
+        table = next(other for other in tables if other.name == table.name)
+    controller = _controller(problem, table, tables)
     estimator = _estimator(study.estimator, controller)
     counts = study.estimator.value_of_information and isinstance(estimator, LoadBank)
     counts = counts and any(type(one) is MAMPC for one in controller.each)
@@ -47,8 +51,11 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
 
 def _executed(table: ControllerTable, valves: Valves, n_inputs: int) -> ControllerTable:
     """The controller with moves that valves execute, and some more."""
-    assert table.rules is not None
     with said_at(f"controllers, {table.name!r}: "):
+        if table.rules is None:
+            raise MampcError(
+                f"compensate: expected rules, received the method {table.method!r}, which has none"
+            )
         least = EXECUTED * as_vector("actuators.jump", valves.jump, n_inputs)
         size = np.maximum(as_vector("min_size", table.rules.min_size, n_inputs), least)
     return table.model_copy(update={"rules": table.rules.model_copy(update={"min_size": size.tolist()})})

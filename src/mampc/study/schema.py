@@ -207,8 +207,10 @@ class ControllerTable(Table):
 
     @model_validator(mode="after")
     def _rules_where_needed(self) -> ControllerTable:
-        if self.compensate and self.method not in METHODS:
-            raise ValueError(f"compensate with one of {', '.join(METHODS)} only; received {self.method!r}")
+        if self.compensate and self.method not in (*METHODS, BANK):
+            raise ValueError(
+                f"compensate with one of {', '.join(METHODS)}, {BANK} only; received {self.method!r}"
+            )
         if (self.method == BANK) != bool(self.variants):
             raise ValueError(f"variants, names of other controllers, with the method {BANK!r} and no other")
         if self.method == BANK:
