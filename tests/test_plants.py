@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from mampc import MampcError, linearise
+from mampc import MampcError, Names, excite, linearise
 from mampc.plants import Plant, QuadrupleTank, SolidOxideFuelCell, advance
 
 TANK = QuadrupleTank()
@@ -195,3 +195,49 @@ def test_batches_are_advanced_as_one_by_one(plant, dt):
     ends = advance(plant, states, inputs, dt)
     for i in np.ndindex(3, 4):
         np.testing.assert_allclose(ends[i], advance(plant, states[i], inputs[i], dt), rtol=1e-12)
+
+
+class Rescaled:
+    """A plant with its states in another unit."""
+
+    def __init__(self, plant, unit):
+        self.plant, self.unit, self.names, self.u_op = plant, unit, plant.names, plant.u_op
+
+    def derivative(self, x, u):
+        return self.unit * self.plant.derivative(x / self.unit, u)
+
+    def output(self, x, u):
+        return self.plant.output(x / self.unit, u)
+
+    def steady_state(self, u=None):
+        return self.unit * self.plant.steady_state(u)
+
+
+class RunawayReactor:
+    """An exothermic reactor that ignites and goes out: dimensionless reactant and temperature, cooled by its input."""
+
+    names = Names(inputs=("cooling",), outputs=("temperature",), states=("reactant", "temperature"))
+    u_op = (1.0,)
+
+    def derivative(self, x, u):
+        rate = 60.0 * x[..., 0] * np.exp(-8.0 / np.maximum(x[..., 1], 0.1))
+        return np.stack(
+            [1 - x[..., 0] - rate, 1 - x[..., 1] + 4 * rate - (x[..., 1] - 1) * u[..., 0]], axis=-1
+        )
+
+    def output(self, x, u):
+        return x[..., 1:]
+
+    def steady_state(self, u=None):
+        return np.array([0.05, 2.9])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-4, 1e6])
+def test_units_of_states_do_not_decide_how_exactly_a_plant_is_integrated(unit):
+    plant = RunawayReactor()
+    courses = []
+    for one in (plant, Rescaled(plant, unit)):
+        inputs = np.repeat([0.5, 3.0, 0.2, 6.0], 8)[:, None]
+        courses.append(excite(one, inputs, dt=0.7).y)
+    assert np.ptp(courses[0]) > 0.5
+    np.testing.assert_allclose(courses[1], courses[0], rtol=1e-8)

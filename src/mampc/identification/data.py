@@ -14,7 +14,7 @@ from mampc.base.checks import Array, as_array, as_matrix, as_number, as_vector, 
 from mampc.base.errors import MampcError
 from mampc.base.files import written_whole
 from mampc.base.names import Names, require_count
-from mampc.plants import Plant, advance
+from mampc.plants import Plant, advance, state_sizes
 from mampc.systems.state_space import StateSpace
 
 if TYPE_CHECKING:
@@ -175,10 +175,10 @@ def excite(
     else:
         x = as_array("x0", plant.steady_state(getattr(plant, "u_op", signal[0])) if x0 is None else x0)
         x = as_vector("x0", x, len(plant.names.states) or x.size)
-        y = np.empty((len(signal), l))
+        y, sizes = np.empty((len(signal), l)), state_sizes(plant)
         for k, inputs in enumerate(signal):
             y[k] = plant.output(x, inputs)
-            x = advance(plant, x, inputs, dt)
+            x = advance(plant, x, inputs, dt, sizes=sizes)
     spread = as_vector("noise", noise, l)
     if (spread < 0).any():
         raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")

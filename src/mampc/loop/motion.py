@@ -9,7 +9,7 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
-from mampc.plants import Plant, advance
+from mampc.plants import Plant, advance, state_sizes
 from mampc.systems.state_space import StateSpace
 
 Faults = tuple[str, ...]
@@ -38,8 +38,8 @@ def motion_of(plant: Plant | StateSpace, dt: float) -> Motion:
         MampcError: a discrete plant with another sample time.
     """
     if not isinstance(plant, StateSpace):
-        faults = getattr(plant, "faults", lambda x, u: ())
-        return Motion(plant.output, lambda x, u: advance(plant, x, u, dt), faults)
+        faults, sizes = getattr(plant, "faults", lambda x, u: ()), state_sizes(plant)
+        return Motion(plant.output, lambda x, u: advance(plant, x, u, dt, sizes=sizes), faults)
     _require_sampled(plant, dt)
     A, B, C, D, op, y_op = plant.A, plant.B, plant.C, plant.D, plant.all_inputs_op, plant.y_op
     return Motion(
@@ -63,8 +63,11 @@ def motions_of(plants: Sequence[Plant | StateSpace], dt: float, x: Array, u: Arr
             lambda x, u: y_op + x @ C + (u - op) @ D, lambda x, u: x @ A + (u - op) @ B, lambda x, u: {}
         )
     if alike and not isinstance(first, StateSpace) and _takes_batches(first, x[0], u[0]):
+        sizes = state_sizes(first)
         return Motions(
-            first.output, lambda x, u: advance(first, x, u, dt), lambda x, u: _batch_faults(first, x, u)
+            first.output,
+            lambda x, u: advance(first, x, u, dt, sizes=sizes),
+            lambda x, u: _batch_faults(first, x, u),
         )
     if all(isinstance(plant, StateSpace) for plant in plants):
         return _stacked([plant for plant in plants if isinstance(plant, StateSpace)], dt)

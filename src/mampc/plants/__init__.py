@@ -1,7 +1,7 @@
 """Plants with documented parameters, and what a plant of your own must have."""
 
 from mampc.plants.columns import ogunnaike_ray, wood_berry
-from mampc.plants.integration import advance
+from mampc.plants.integration import advance, state_sizes
 from mampc.plants.level import Level
 from mampc.plants.plant import Plant
 from mampc.plants.quadruple_tank import QuadrupleTank
@@ -16,5 +16,6 @@ __all__ = [
     "VanDeVusse",
     "advance",
     "ogunnaike_ray",
+    "state_sizes",
     "wood_berry",
 ]

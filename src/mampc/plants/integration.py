@@ -37,17 +37,38 @@ STAGES = (
 ERROR = np.array([71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 EXTRAPOLATED = 8  # linearly implicit Euler steps with 1 to 8 substeps
 STIFF = 3.0  # times h: an explicit step is not stable for faster modes
+ROUNDED = 1e-12  # up to here a steady state is zero: units of states are not as large as that
 SLOPE = 1e-7  # of a state's size: steps of the differences for its Jacobian
 
 
-def advance(plant: Plant, x: Array, u: Array, dt: float) -> Array:
+def state_sizes(plant: Plant) -> Array | None:
+    """How large each state usually is, shape (n,): as in the plant's steady state, one where that is zero; None where
+    it tells none.
+    """
+    try:
+        sizes = np.abs(np.asarray(plant.steady_state(), dtype=float))
+    except Exception:  # whatever a plant without usual inputs does when it is asked for their steady state
+        return None
+    return np.where(np.isfinite(sizes) & (sizes > ROUNDED), sizes, 1.0) if sizes.ndim == 1 else None
+
+
+def advance(plant: Plant, x: Array, u: Array, dt: float, *, sizes: Array | None = None) -> Array:
     """The states dt seconds later, shape (..., n), from x (..., n) under constant inputs u (..., m + d).
+
+    Args:
+        plant: what moves.
+        x, u: states and inputs.
+        dt: seconds.
+        sizes: of the states, shape (n,), of which errors are a share where a state is smaller (see `state_sizes`);
+            default one in each unit.
 
     Raises:
         MampcError: the integration failed.
     """
     x, u = np.asarray(x, dtype=float), np.asarray(u, dtype=float)
-    end, error = _in_steps(_explicit, 1, plant, x, u, dt)
+    if sizes is None or sizes.shape != x.shape[-1:]:
+        sizes = np.ones(x.shape[-1:])
+    end, error = _in_steps(_explicit, 1, plant, x, u, dt, sizes)
     if not (error <= 1).all():
         inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[-1]))
         for kind, steps, largest in FINER:
@@ -55,33 +76,37 @@ def advance(plant: Plant, x: Array, u: Array, dt: float) -> Array:
             if not chosen.any():
                 continue
             if x.ndim == 1:  # a plant of the user's may take nothing else
-                end, error = _in_steps(kind, steps, plant, x, u, dt)
+                end, error = _in_steps(kind, steps, plant, x, u, dt, sizes)
             else:
-                end[chosen], error[chosen] = _in_steps(kind, steps, plant, x[chosen], inputs[chosen], dt)
+                end[chosen], error[chosen] = _in_steps(
+                    kind, steps, plant, x[chosen], inputs[chosen], dt, sizes
+                )
         for place in map(tuple, np.argwhere(~(error <= 1))):
-            end[place] = _by_lsoda(plant, x[place], inputs[place], dt)
+            end[place] = _by_lsoda(plant, x[place], inputs[place], dt, sizes)
     # Rounding must not make a level or a pressure negative.
     end = np.maximum(end, getattr(plant, "x_min", -np.inf))
     return end
 
 
-Kind = Callable[[Plant, Array, Array, float], tuple[Array, Array]]
+Kind = Callable[[Plant, Array, Array, float, Array], tuple[Array, Array]]
 
 
-def _in_steps(kind: Kind, steps: int, plant: Plant, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
+def _in_steps(
+    kind: Kind, steps: int, plant: Plant, x: Array, u: Array, dt: float, sizes: Array
+) -> tuple[Array, Array]:
     """The ends of some steps of equal length, shape (..., n), and the largest error of each, shape (...)."""
     error: Array = np.zeros(x.shape[:-1])
     with np.errstate(all="ignore"):  # what is no number counts as too large an error
         for _ in range(steps):
-            end, estimate = kind(plant, x, u, dt / steps)
+            end, estimate = kind(plant, x, u, dt / steps, sizes)
             size = np.abs(end)
-            share = estimate / (ATOL * np.maximum(size, 1.0) + RTOL * size)
+            share = estimate / (ATOL * np.maximum(size, sizes) + RTOL * size)
             share[~np.isfinite(end)] = np.inf
             x, error = end, np.maximum(error, share.max(axis=-1, initial=0.0))
     return x, np.where(np.isnan(error), np.inf, error)
 
 
-def _explicit(plant: Plant, x: Array, u: Array, h: float) -> tuple[Array, Array]:
+def _explicit(plant: Plant, x: Array, u: Array, h: float, sizes: Array) -> tuple[Array, Array]:
     """A step of Dormand and Prince, and its estimated error, both of shape (..., n)."""
     rates, end = np.empty((len(ERROR), *x.shape)), x
     flat = rates.reshape(len(rates), -1)
@@ -92,12 +117,12 @@ def _explicit(plant: Plant, x: Array, u: Array, h: float) -> tuple[Array, Array]
     return end, np.abs(h / LENIENT * ERROR.dot(flat).reshape(x.shape))
 
 
-def _implicit(plant: Plant, x: Array, u: Array, h: float) -> tuple[Array, Array]:
+def _implicit(plant: Plant, x: Array, u: Array, h: float, sizes: Array) -> tuple[Array, Array]:
     """A linearly implicit step of Euler with 1, 2, .. substeps, extrapolated; its estimated error."""
     first, n = np.asarray(plant.derivative(x, u)), x.shape[-1]
     jacobian = np.empty((*x.shape, n))
     for i in range(n):
-        step, moved = SLOPE * np.maximum(np.abs(x[..., i]), 1e-3), x.copy()
+        step, moved = SLOPE * np.maximum(np.abs(x[..., i]), 1e-3 * sizes[i]), x.copy()
         moved[..., i] += step
         jacobian[..., i] = (plant.derivative(moved, u) - first) / step[..., None]
     jacobian[~np.isfinite(jacobian).all(axis=(-1, -2))] = 0.0
@@ -132,7 +157,7 @@ FINER: tuple[tuple[Kind, int, float], ...] = (
 )
 
 
-def _by_lsoda(plant: Plant, x: Array, u: Array, dt: float) -> Array:
+def _by_lsoda(plant: Plant, x: Array, u: Array, dt: float, sizes: Array) -> Array:
     from scipy.integrate import solve_ivp
 
     def rate(_: float, state: Array) -> Array:
@@ -141,7 +166,7 @@ def _by_lsoda(plant: Plant, x: Array, u: Array, dt: float) -> Array:
             raise MampcError(f"{type(plant).__name__}: the integration failed at inputs {u}: rates {change}")
         return change
 
-    atol = ATOL * np.maximum(np.abs(x), 1.0)
+    atol = ATOL * np.maximum(np.abs(x), sizes)
     result = solve_ivp(rate, (0.0, dt), x, method="LSODA", rtol=RTOL, atol=atol)
     if not result.success or not np.isfinite(result.y[:, -1]).all():
         raise MampcError(f"{type(plant).__name__}: the integration failed at inputs {u}: {result.message}")
