@@ -155,7 +155,8 @@ def test_later_moves_add_no_less_than_is_said(counting):
     for level, left, paid in product(range(n), (1, 2, n), (False, True)):
         if paid and (counting == "elementwise" or level % 2 == 0):
             continue
-        said = at.terms.later(level, np.array([left]), np.array([paid]) if paid else None)[0]
+        paying = np.array([paid]) if paid else None
+        said = [at.terms.later(level, np.array([left]), paying, more)[0] for more in (1, 2)]
         for size in range(1, n - level + 1):
             for made in combinations(range(level, n), size):
                 samples = {i // 2 for i in made} - ({level // 2} if paid else set())
@@ -166,7 +167,9 @@ def test_later_moves_add_no_less_than_is_said(counting):
                     0.2 * counted if counting == "simultaneous" else sum((0.2, 0.4)[i % 2] for i in made)
                 )
                 adds = charged - at.terms.support[list(made)].sum(axis=0)
-                assert (said <= adds + 1e-12).all()
+                assert (said[0] <= adds + 1e-12).all()
+                if size > 1 and counting == "elementwise":
+                    assert (said[1] <= adds + 1e-12).all()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -339,6 +342,21 @@ def test_prices_of_moves_that_can_be_large_take_one_relaxed_program(monkeypatch)
     decision = decide(problem, mampc.MoveRules(price=1.0), rng.standard_normal(3), 2 * rng.standard_normal(2))
     assert decision.status is Status.OPTIMAL
     assert 0 < len(rounds) <= ROUNDS
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_where_a_second_move_does_not_pay_single_moves_are_priced_at_once(seed, monkeypatch):
+    problem = random_problem(seed, n_c=6)
+    x, reference = np.zeros(3), problem.model.y_op + 0.1
+    mpc = mampc.MPC(problem)
+    free = mpc.step(mpc.initial_state(), x, reference).objective
+    hold = decide(problem, mampc.MoveRules(price=1e3), x, reference).objective
+    price = 0.55 * (hold - free)
+    monkeypatch.setattr(tree, "children_of", lambda *_: pytest.fail("a node was split"))
+    decision = decide(problem, mampc.MoveRules(price=price), x, reference)
+    one = decide(problem, mampc.MoveRules(max_moves=1), x, reference).objective
+    assert decision.status is Status.OPTIMAL
+    assert decision.objective == pytest.approx(min(hold, one + price), rel=1e-9)
 
 
 def drawn_case(seed, scale_u=1.0):

@@ -110,9 +110,9 @@ class Terms:
         self._later = [table[:, last] for table in self._later]
         self.latest -= 1
 
-    def at_root(self, left: int) -> float:
-        """The bound before anything is decided, where so many moves are left."""
-        return float((self.rest + self.later(0, np.array([left]), None)[0]).max())
+    def at_root(self, left: int, more: int = 1) -> float:
+        """The bound before anything is decided, where so many moves are left, of which so many are made at least."""
+        return float((self.rest + self.later(0, np.array([left]), None, more)[0]).max())
 
     def priced(self, found: Multipliers, s: Array) -> tuple[Array, float]:
         """c and rest with these multipliers of rows and the pulls s."""
@@ -166,15 +166,15 @@ class Terms:
             one_later[i] = min(least, of.price[0] - inside)
         return all_later, one_later, own
 
-    def later(self, level: int, left: Indices, paid: BoolArray | None) -> Array:
-        """What the moves from `level` on add at least where some are made, shape (N, K).
+    def later(self, level: int, left: Indices, paid: BoolArray | None, more: int = 1) -> Array:
+        """What the moves from `level` on add at least where so many or more are made, shape (N, K).
 
         Args:
             left: how many moves, as budget and price count them, each node may still make, shape (N,).
             paid: with simultaneous counting, whether moving at the sample of `level` is paid for.
         """
         everything, one, own = (table[level] for table in self._later)
-        adds: Array = np.where(one < 0, np.maximum(everything, left[:, None] * one), one)
+        adds: Array = np.where(one < 0, np.maximum(everything, left[:, None] * one), more * one)
         if paid is None or not paid.any():
             return adds
         following = self._domain.next_sample[level]

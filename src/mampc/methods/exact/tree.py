@@ -87,6 +87,7 @@ class PatternTree:
         limited, close = bool(sample.margins.min(initial=np.inf) < 0), self._close
         if limited:
             self._relax_root(problem)
+        batches = _BatchSearch(problem)
         if not (limited and close):
             terms, f = problem.terms, np.zeros(self._admissible.n_moves)
             f[problem.order] = -2.0 * (terms.c[:, -1] @ self._squares.L[:, :-1])
@@ -94,11 +95,11 @@ class PatternTree:
             found = problem.relaxation.of_bounds(best.multipliers)
             if found is not None and found.active:
                 terms.add(found)
-            if not limited and self._admissible.priced:
+            if not limited and self._admissible.priced and not batches.ends_at_once:
                 close &= self._relax_root(problem, WORTH)
         if problem.terms.at_root(allowance.left) >= problem.cutoff:
             return np.inf
-        return Branching(problem).run() if close else _BatchSearch(problem).run()
+        return Branching(problem).run() if close and not batches.ends_at_once else batches.run()
 
     def _relax_root(self, problem: SampleProblem, worth: float = 0.0) -> bool:
         """Bound everything with limits and prices as a relaxed program has them, and try its moves.
@@ -141,12 +142,18 @@ class _BatchSearch:
         self._problem, self._of, self._terms = problem, problem.admissible, problem.terms
         self._squares, self._order = problem.squares, problem.order
         self._left_at_root = problem.allowance.left
-        # Nodes with one move left need no descendants: all last moves are priced at once.
+        # Nodes that get one move more at most need no descendants: all last moves are priced at once.
         self._resolves = not (self._of.sized or self._of.simultaneous or self._squares.refined)
         # Another move never costs more: then only patterns that spend the whole budget are of interest.
         self._nested = self._of.simple and not (
             self._of.priced or self._of.sized or any(problem.allowance.frozen)
         )
+
+    @property
+    def ends_at_once(self) -> bool:
+        """Whether no two moves pay."""
+        left = self._problem.allowance.left
+        return self._resolves and self._terms.at_root(left, 2) >= self._problem.cutoff
 
     def run(self) -> float:
         """A lower bound over everything that was not visited: infinite when the search is complete."""
@@ -169,6 +176,8 @@ class _BatchSearch:
             nodes = self._renewed(level, nodes, ids)
             ids = list(self._terms.ids)
             ended = nodes.used >= self._left_at_root - self._resolves
+            if self._resolves and self._of.priced:
+                ended |= self._bound_of(level, nodes, 2) >= problem.cutoff  # two more moves do not pay
             if ended.any() and (self._resolves or self._nested):
                 if self._resolves:
                     self._try_last_moves(level, nodes.take(ended))
@@ -206,11 +215,15 @@ class _BatchSearch:
 
     def _bounded(self, level: int, nodes: Nodes) -> Nodes:
         """The nodes, which have decided `level` moves and will make another one, with their bounds."""
+        return nodes._replace(bound=np.maximum(nodes.bound, self._bound_of(level, nodes, 1)))
+
+    def _bound_of(self, level: int, nodes: Nodes, more: int) -> Array:
+        """What nodes, which have decided `level` moves, cost with at least so many more, shape (N,)."""
         paid = nodes.now > 0 if self._of.simultaneous else None
-        value = nodes.value + self._terms.later(level, self._left_at_root - nodes.used, paid)
+        value = nodes.value + self._terms.later(level, self._left_at_root - nodes.used, paid, more)
         if self._of.sized:
             value += lift(nodes.low, nodes.high, nodes.d, variance_of(nodes.root))
-        return nodes._replace(bound=np.maximum(nodes.bound, value.max(axis=1) + nodes.charge))
+        return np.asarray(value.max(axis=1) + nodes.charge)
 
     def _sharpened(self, level: int, nodes: Nodes) -> Nodes:
         """The nodes bounded with the multipliers of the most promising one, where limits matter and it may pay."""
