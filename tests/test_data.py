@@ -119,7 +119,7 @@ def test_a_given_step_needs_no_time_column_and_contradicts_none(tmp_path):
     [
         ("", "expected a header and at least one row of numbers, received 0 rows"),
         ("\n\n", "received 0 rows"),
-        ("time,u,y\n", "received 1 rows"),
+        ("time,u,y\n", "received 1 row"),
         ("time,u,y\n0,1,2\n1,2\n", "expected 3 fields in row 3, received 2"),
         ("time,u,y\n0,1,2\n\n1,2,3,4\n", "expected 3 fields in row 4, received 4"),
         ("time,u,z\n0,1,2\n", r"expected one column 'y', received columns \['time', 'u', 'z'\]"),

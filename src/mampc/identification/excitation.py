@@ -30,7 +30,7 @@ def missing_movement(inputs: Mapping[str, Array]) -> list[str]:
     for name, own in moves.items():
         count = int(np.count_nonzero(own))
         if count < FEW_MOVES:
-            times, samples = "time" if count == 1 else "times", len(inputs[name])
+            times, samples = "time" if count == 1 else "times", int(np.count_nonzero(~np.isnan(inputs[name])))
             said.append(
                 f"{name} moves {count} {times} in {samples} samples: move it up and down at least {FEW_MOVES} times"
             )

@@ -69,7 +69,7 @@ def identify_and_write(
     notes: list[str] = []
     for path in exports:
         export = read_export(path, **reading)
-        records += export.records
+        records += like_the_others(path, export.records, records)
         notes += [f"{path}: {note}" if len(exports) > 1 else note for note in export.notes]
     require_writable(target)
     estimation, rest = hold_out(long_enough(records, notes), share)
@@ -109,6 +109,28 @@ def identify_and_write(
     except MampcError as error:
         warnings.append(f"no figure written; {error}")
     return Outcome(identified, validation, tuple(notes), tuple(warnings), tuple(map(len, estimation)))
+
+
+def like_the_others(path: Path, found: Sequence[IOData], others: Sequence[IOData]) -> list[IOData]:
+    """The records of one more export of a plant, with the names and units of the first.
+
+    Raises:
+        MampcError: another sample time, or another unit.
+    """
+    if not others:
+        return list(found)
+    first, own = others[0], found[0]
+    units = dict(first.names.units)
+    for name, unit in own.names.units:
+        if units.get(name, unit) != unit:
+            raise MampcError(
+                f"{path}: expected {name} in {units[name]} as before, received {unit}; export all alike"
+            )
+    if abs(own.dt - first.dt) > 1e-6 * first.dt:
+        raise MampcError(
+            f"{path}: expected samples every {first.dt:g} s as before, received {own.dt:g} s; export all alike"
+        )
+    return [replace(record, names=first.names) for record in found]
 
 
 def long_enough(records: Sequence[IOData], notes: list[str]) -> Sequence[IOData]:
@@ -186,6 +208,8 @@ def require_writable(target: Path) -> None:
         raise MampcError(f"--out: expected a name that ends in .json, received {target}")
     if not os.path.isdir(target.parent):
         raise MampcError(f"--out: expected a file in a folder that exists, received {target}")
+    if not os.access(target.parent, os.W_OK):
+        raise MampcError(f"--out: expected a file in a folder that can be written to, received {target}")
     if os.path.exists(target):
         try:
             StateSpace.load(target)

@@ -289,7 +289,7 @@ def _measured(
         findings.require_none()
     if not numbers:
         raise MampcError(
-            f"{findings.origin}: expected a header and at least one row of numbers, received 1 rows"
+            f"{findings.origin}: expected a header and at least one row of numbers, received 1 row"
             if not descriptions
             else f"{findings.origin}: expected rows of numbers under the header, received "
             f"{shown(descriptions[0][1], 200)} in row {descriptions[0][0]}"
