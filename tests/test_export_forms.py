@@ -339,9 +339,7 @@ def test_a_row_with_too_few_fields_and_no_number_is_a_missing_sample_and_one_wit
     content = rows(lambda k, u, y: "broken" if k == 7 else f"{u},{y}", ["u,y"])
     assert [len(record) for record in read(tmp_path, content, dt=10.0).records] == [7, 12]
     content = rows(lambda k, u, y: f"{u}" if k == 7 else f"{u},{y}", ["u,y"])
-    with pytest.raises(
-        MampcError, match="expected 2 fields, as many as names in row 1, in row 9, received 1"
-    ):
+    with pytest.raises(MampcError, match="expected 2 fields in row 9, received 1; the names stand in row 1"):
         read(tmp_path, content, dt=10.0)
 
 

@@ -18,7 +18,7 @@ def test_exports_of_one_plant_are_alike():
     june = Path("june.csv")
     [added] = like_the_others(june, [record(unit="")], [record()])
     assert added.names == record().names
-    with pytest.raises(MampcError, match="june.csv: expected u in % as before, received m3/h"):
+    with pytest.raises(MampcError, match=r"june\.csv: expected u in % as before, received m3/h"):
         like_the_others(june, [record(unit="m3/h")], [record()])
-    with pytest.raises(MampcError, match="june.csv: expected samples every 10 s as before, received 20 s"):
+    with pytest.raises(MampcError, match=r"june\.csv: expected samples every 10 s as before, received 20 s"):
         like_the_others(june, [record(dt=20.0)], [record()])

@@ -269,12 +269,16 @@ def _measured(
     if remarks:
         findings.note(f"remarks behind a # in {rows_text(remarks)} left out")
     skipped = frozenset([*repeated, *remarks, *footer, *(number for number, _ in [*descriptions, *ragged])])
-    fields = f"{width} fields, as many as names in row {header_number},"
+    names_in = f"the names stand in row {header_number}"
     if len(ragged) == 1:
-        findings.doubt(f"expected {fields} in row {ragged[0][0]}, received {len(ragged[0][1])}")
+        findings.doubt(
+            f"expected {width} fields in row {ragged[0][0]}, received {len(ragged[0][1])}; {names_in}"
+        )
     elif ragged:
         places = rows_text([number for number, _ in ragged])
-        findings.doubt(f"expected {fields} in every row, received {len(ragged[0][1])} in {places}")
+        findings.doubt(
+            f"expected {width} fields in every row, received {len(ragged[0][1])} in {places}; {names_in}"
+        )
     if ragged and separator == "," and all(len(cells) > width for _, cells in ragged):
         findings.doubt(
             "commas may both separate fields and mark decimals: save with semicolons between fields"
