@@ -75,6 +75,20 @@ def test_dead_times_alone_are_no_zeros(column):
     assert not len(properties(column).limiting_zeros)
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_the_zero_of_one_channel_is_told(scale):
+    # (1 - 20 s) / ((60 s + 1) (20 s + 1)), alone and twice beside each other
+    A, B, C = np.diag([-1 / 60, -1 / 20]), np.array([[1 / 60], [1 / 20]]), np.array([[2.0, -1.0]])
+    alone = mampc.StateSpace(A, B, scale * C, None, 0.0).discretise(5.0)
+    twice = mampc.StateSpace(
+        np.kron(np.eye(2), A), np.kron(np.eye(2), B), np.kron(np.diag([1.0, scale]), C), None, 0.0
+    ).discretise(5.0)
+    for model, count in ((alone, 1), (twice, 2)):
+        found = properties(model).limiting_zeros
+        assert len(found) == count
+        np.testing.assert_allclose(found, 20.0, rtol=0.1)
+
+
 def test_what_grows_is_told():
     model = StateSpace([[1.1, 0.0], [0.0, 0.5]], [[1.0], [1.0]], np.eye(2), None, 1.0)
     found = properties(model)

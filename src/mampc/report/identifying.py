@@ -121,7 +121,7 @@ def like_the_others(path: Path, found: Sequence[IOData], others: Sequence[IOData
         return list(found)
     first, own = others[0], found[0]
     units = dict(first.names.units)
-    for name, unit in own.names.units:
+    for name, unit in dict(own.names.units).items():
         if units.get(name, unit) != unit:
             raise MampcError(
                 f"{path}: expected {name} in {units[name]} as before, received {unit}; export all alike"

@@ -204,16 +204,19 @@ def _limiting(model: StateSpace) -> Array | None:
 def _is_zero(model: StateSpace, zero: complex) -> bool:
     m = model.n_inputs
 
-    def smallest(z: complex) -> float:
-        gain: ComplexArray = model.C @ np.linalg.solve(z * np.eye(model.n_states) - model.A, model.B[:, :m])
-        gain = gain + model.D[:, :m]
-        rows = np.linalg.norm(gain, axis=1, keepdims=True)
-        return float(np.linalg.svd(gain / np.where(rows > 0, rows, 1.0), compute_uv=False)[-1])
+    def gain(z: complex) -> ComplexArray:
+        found: ComplexArray = model.C @ np.linalg.solve(z * np.eye(model.n_states) - model.A, model.B[:, :m])
+        return found + model.D[:, :m]
 
     try:
-        return smallest(zero) < SINGULAR * smallest(1 + (zero - 1) * 1.3)
+        here, near = gain(zero), gain(1 + (zero - 1) * 1.3)
     except np.linalg.LinAlgError:
         return False
+    rows = np.linalg.norm(near, axis=1, keepdims=True)  # not those at the zero, where a whole row may vanish
+    smallest, usual = (
+        np.linalg.svd(matrix / np.where(rows > 0, rows, 1.0), compute_uv=False)[-1] for matrix in (here, near)
+    )
+    return bool(smallest < SINGULAR * usual)
 
 
 def gain_deviation(model: StateSpace, found: Properties) -> Array | None:
