@@ -40,14 +40,12 @@ class OpenPatterns:
         self._of_table = ranking.rows(past)
         self.rows: Indices = np.arange(self._of_table.start, self._of_table.start + len(bounds))
         self.bounds = bounds
-        # All of these once multipliers are priced in: the open part of the table and prices; per multipliers x, D and
-        # the level; and per multipliers and pattern x' T x - |D|^2.
+        # All of these once multipliers are priced in: the open part of the table and prices; per multipliers
+        # (x, D, level); and per multipliers and pattern the bound, its price aside.
         self._table: Array | None = None
         self._charge: Array
-        self._x: Array
-        self._shift: Array
-        self._level: Array
-        self._square: Array
+        self._held: Array
+        self._values: Array
 
     def best(self) -> tuple[int, float]:
         """The position of the pattern with the least bound, and that: infinite when none is left."""
@@ -73,13 +71,14 @@ class OpenPatterns:
             self._begin(open_)
         elif 2 * np.count_nonzero(open_) < len(open_):
             self.rows, self.bounds, self._charge = self.rows[open_], self.bounds[open_], self._charge[open_]
-            self._table, self._square = self._table[open_], self._square[:, open_]
+            self._table, self._values = self._table[open_], self._values[:, open_]
         if not len(self.rows):
             return
         values = self._take(cost)
         values += self._charge
         if self._ranking.admissible.sized:
-            values += self._ranking.lift(self._x[-1:], self.rows)[:, 0]
+            x = self._held[-1:, : len(cost.target)]
+            values += self._ranking.lift(x, self.rows)[:, 0]
         np.maximum(self.bounds, values, out=self.bounds)
 
     def _begin(self, open_: BoolArray) -> None:
@@ -93,8 +92,8 @@ class OpenPatterns:
             self._table = ranking.squares[self._of_table]
         self._charge = ranking.charges(self.rows, sample.later_data)
         x = ranking.scaled(sample.least_squares)
-        self._x, self._shift, self._level = x[None], np.zeros((1, len(x))), np.array([[sample.cost]])
-        self._square = without[None]
+        self._held = np.concatenate((x, np.zeros(len(x)), (sample.cost,)))[None]
+        self._values = without[None] + sample.cost
         self._rounding = 2 * ranking.rounding(x)
 
     def _take(self, cost: LeastSquares) -> Array:
@@ -102,29 +101,28 @@ class OpenPatterns:
         assert self._table is not None
         ranking, (K, n) = self._ranking, self._table.shape[:2]
         x, shift = ranking.scaled(cost), cost.target - self._sample.target
-        moved = float(shift.dot(shift))
-        level = cost.least + moved
+        level = cost.least + float(shift.dot(shift))
         self._rounding = max(self._rounding, 2 * ranking.rounding(x))
-        of_x = self._table.reshape(K * n, n).dot(x).reshape(K, n)
-        square = of_x.dot(x)
-        square -= moved
-        values = square + (level - self._rounding)
-        # With s of the way: (1 - s)^2 square + 2 s (1 - s) across + s^2 (that of the earlier ones).
-        slope = self._x.dot(of_x.T)
-        slope -= self._shift.dot(shift)[:, None]
-        slope -= square
-        curvature = self._square - square
-        slope *= 2
-        curvature -= slope
-        slope += self._level - level
-        share = slope / np.minimum(curvature, -FLAT)
-        share *= -0.5
+        new = np.concatenate((x, shift, (level,)))
+        # How the bound grows with x, D and the level.
+        gradient = np.empty((K, 2 * n + 1))
+        gradient[:, :n] = self._table.reshape(K * n, n).dot(2 * x).reshape(K, n)
+        gradient[:, n : 2 * n], gradient[:, 2 * n] = -2 * shift, 1.0
+        value = gradient.dot(new)
+        value += level
+        value *= 0.5
+        # A share s of the way to earlier multipliers adds s (slope - s bend).
+        slope = (self._held - new).dot(gradient.T)
+        bend = slope - self._values
+        bend += value
+        share = slope / np.maximum(bend, FLAT)
+        share *= 0.5
         np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
-        curvature *= share
-        curvature += slope
-        curvature *= share
-        values += np.maximum(curvature.max(axis=0), 0.0)
-        self._x, self._shift = np.concatenate((self._x, x[None])), np.concatenate((self._shift, shift[None]))
-        self._level = np.concatenate((self._level, [[level]]))
-        self._square = np.concatenate((self._square, square[None]))
-        return np.asarray(values)
+        bend *= share
+        slope -= bend
+        slope *= share
+        self._held = np.concatenate((self._held, new[None]))
+        self._values = np.concatenate((self._values, value[None]))
+        best: Array = value + np.maximum(np.maximum.reduce(slope), 0.0)
+        best -= self._rounding
+        return best
