@@ -269,9 +269,13 @@ def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path, few_figures
     outcome, summary, missing = run_and_write(parse_study(text), tmp_path / "out")
     assert missing == ()
     console = Console(width=200, file=io.StringIO())
+    for scenario in summary["scenarios"]:
+        for entry in scenario["controllers"]:
+            entry["tracking_error"] = 1.234e-9  # of outputs in small units
     for table in comparison_tables(outcome.study, summary):
         console.print(table)
     assert "a [/b] $" in console.file.getvalue()
+    assert "1.23e-09" in console.file.getvalue()
 
 
 def test_trajectories_of_names_that_share_words_stay_apart(tmp_path, few_figures):

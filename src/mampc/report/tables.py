@@ -67,6 +67,8 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
         table.add_column(header, justify="right", no_wrap=True)
     entries = {entry["name"]: entry if part is None else entry[part] for entry in scenario["controllers"]}
     times = {entry["name"]: entry["solve_time_us"]["median"] for entry in scenario["controllers"]}
+    largest = max(found["tracking_error"] for found in entries.values())
+    error_form = ".3f" if 0.1 <= largest < 1e5 else ".3g"  # errors of any unit have digits to compare
     for controller in study.controllers:
         entry, reference = entries[controller.name], entries[base.name]
         density = entry["sparse_density"]
@@ -74,7 +76,7 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
             escape(controller.name),
             _several(density["per_input"]),
             _several(density["exact_per_input"]),
-            f"{entry['tracking_error']:.3f}",
+            f"{entry['tracking_error']:{error_form}}",
             *(_outside(entry, key, form) for key, form in OUTSIDE if zones),
             _ratios(
                 density["per_input"], reference["sparse_density"]["per_input"],
