@@ -388,3 +388,5 @@ def test_values_that_leap_away_or_stay_are_told_and_kept(tmp_path, scale):
     )
     stuck = [f"{u[k]},{y[60]:.9g}" if 60 <= k < 75 else line for k, line in enumerate(plain)]
     assert "for 15 samples from row 62 on, and moves nearly always elsewhere" in notes(stuck)
+    steps = [f"{y[k]:.9g},{np.repeat(u, 4)[k]:.9g}" for k in range(400)]
+    assert not notes(steps)
