@@ -53,6 +53,30 @@ def test_a_random_walk_leaves_the_gain_roughly_right(seed, step, units):
     assert gain_of(n4sid(record, feedthrough=False), units) == pytest.approx(2.0, rel=0.3)
 
 
+def test_slow_and_fast_channels_keep_their_states_under_coloured_noise():
+    """Six lags of 3 to 40 samples and noise of a pole at 0.9: the error stays small beside the gains."""
+    rng = np.random.default_rng(1)
+    gain = rng.uniform(0.3, 2.0, (3, 2)) * rng.choice([-1, 1], (3, 2))
+    plant = StateSpace.from_first_order(
+        gain=gain, time_constant=np.exp(rng.uniform(np.log(3), np.log(40), (3, 2))), dead_time=0.0, dt=1.0
+    )
+    u = prbs(order=10, hold=8, inputs=2, samples=3000, seed=0)
+    clean = plant.response(plant.u_op + u)
+    noise = lfilter(
+        [np.sqrt(1 - 0.81)], [1.0, -0.9], np.random.default_rng(5).standard_normal(clean.shape), axis=0
+    )
+    fitted = n4sid(IOData(u, clean + 0.3 * clean.std(axis=0) * noise, 1.0), feedthrough=False)
+    error = np.abs(fitted.model.step_response(100) - plant.step_response(100)).max(axis=(0, 2))
+    assert (error < 0.2 * np.abs(gain).max(axis=1)).all()
+
+
+@pytest.mark.parametrize("detrend", ["whitened", "differences", "linear"])
+def test_any_trend_may_be_asked_of_a_record_with_white_noise(detrend):
+    fitted = n4sid(record_with(lambda rng, N: 0.0), feedthrough=False, detrend=detrend)
+    assert fitted.detrend == detrend
+    assert gain_of(fitted) == pytest.approx(2.0, abs=0.1)
+
+
 def test_a_record_that_does_not_drift_is_not_detrended():
     for seed in range(4):
         fitted = n4sid(record_with(lambda rng, N: 0.0, seed=seed), feedthrough=False)

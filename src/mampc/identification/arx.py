@@ -25,7 +25,7 @@ HIGHEST = 8  # order of one output
 def estimate_arx(
     records: Scaled, delays: Integers, settings: Settings, trend: str, orders: Sequence[int] | None = None
 ) -> list[Part]:
-    """One part per output, each with the smallest order that explains the record nearly best.
+    """One part per output, each with the order that explains the record best for its size.
 
     Args:
         delays: in samples, shape (l, m).

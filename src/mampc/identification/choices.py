@@ -26,6 +26,7 @@ TRENDS = {
     "differences": "changes were explained, as outputs that drift ask for",
     "whitened": "disturbances were made white first, as their colour or a loop that was closed ask for",
 }
+COLOUR = {"whitened": -2, "differences": -1}  # which to take first where the disturbance is not white
 ENOUGH = 20_000  # samples in which choices are compared
 SHORT = 3  # samples of dead time that are left to the states
 
@@ -117,29 +118,29 @@ def chosen(
     if not any(np.isfinite(score.error) for score in telling):
         why = "Too short to hold a part out, so that nothing was compared"
         return Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
-    # A drift passes for an integrator or a slow mode that inputs hardly move: the fewest of these win, and among
-    # equals changes are explained where what is left of levels walks, else the simplest. Noise is made white only
-    # where it is not, as levels say nothing then. They say nothing under feedback either: inputs answer disturbances.
+    # A drift passes for an integrator that inputs hardly move: the fewest of these win. Among equals disturbances are
+    # made white where they are not; else the simplest trend wins.
+    # Levels say nothing under feedback: inputs answer disturbances.
     first = scores[0]
 
     def is_fair(k: int) -> bool:
         score = scores[k]
+        if k == 0:
+            return True
         if feedback:
             return bool(np.isfinite(score.error))
         if trends[k] == "whitened":
-            alike = score.level <= first.level + CLEARLY and score.states <= first.states
-            return min(score.walk, first.walk) > WALK and alike
-        simple = score.level <= first.level + CLEARLY and score.states <= first.states
-        return k == 0 or simple or score.error < first.error - CLEARLY
+            return min(score.walk, first.walk) > WALK and score.level <= first.level + CLEARLY
+        return score.level <= first.level + CLEARLY or score.error < first.error - CLEARLY
 
     fair = [k for k in range(len(trends)) if is_fair(k)]
     least = min(scores[k].error for k in fair)
     near = [k for k in fair if scores[k].error <= least + AS_GOOD]
     walks = scores[near[0]].walk > WALK
 
-    def rank(k: int) -> tuple[bool, int, int, bool, int]:
+    def rank(k: int) -> tuple[bool, int, int, int]:
         white = feedback and trends[k] != "whitened"
-        return white, scores[k].integrators, scores[k].states, walks and trends[k] != "differences", k
+        return white, scores[k].integrators, COLOUR.get(trends[k], 0) if walks else 0, k
 
     best = min(near, key=rank)
     choice, score = choices[best], scores[best].error

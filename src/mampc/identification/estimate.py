@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -31,14 +32,19 @@ from mampc.identification.subspace import (
     supported_order,
 )
 
-NEAR_BEST = 1.02  # simulation errors that are as good as equal
+ROUNDING = 1e-6  # of the spread: smaller errors are as good as none
 LITTLE = 0.2  # a filter's pole that makes no difference
 EQUATIONS, LEAST = 15_000, 1000  # in which orders are compared, and samples
 SIGNIFICANT = 4.0  # a square of two standard deviations
 FILTERED = ("differences", "whitened")  # trends after whose filter nothing is left of levels
-# Of the trend that is fitted, and of that taken off Hankel rows.
-DEGREES = {"none": -1, "constant": 0, "linear": 1, "differences": -1, "whitened": 0}
-PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0, "whitened": 0}
+DEGREES = {
+    "none": -1,
+    "constant": 0,
+    "linear": 1,
+    "differences": -1,
+    "whitened": 0,
+}  # of the trend that is fitted
+PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0, "whitened": 0}  # taken off Hankel rows
 
 Dynamics = Callable[[int], tuple[Array, Array]]  # A and C of an order
 
@@ -95,7 +101,7 @@ def finished(
     dynamics: Dynamics, orders: Sequence[int], own: Scaled, seen: Scaled, outputs: tuple[int, ...], delays: Integers,
     settings: Settings, trend: str,
 ) -> Part:  # fmt: skip
-    """A part from A and C of several orders: the smallest order that explains the records nearly best.
+    """A part from A and C of several orders: the order that explains the records best for its size.
 
     Args:
         own: the records of the part.
@@ -109,37 +115,69 @@ def finished(
 
     tried: dict[int, Part] = {}
 
-    def attempt(n: int) -> float:
+    def attempt(n: int) -> Part:
         if n not in tried:
             A, C = dynamics(n)
             A, stabilised = inside_unit_circle(A, settings.unstable)
             tried[n] = Part(outputs, delays, A, C, 0, stabilised, fitted(A, C, 0, few))
-        return tried[n].fit.error
+        return tried[n]
 
-    part = tried[_smallest(attempt, orders)]
+    def left(n: int) -> list[Array]:
+        part = attempt(n)
+        return residuals(part.A, part.C, part.fit, few)
+
+    part = attempt(_likeliest(left, orders, few.u[0].shape[1]))
     if few is not seen:
         part = part._replace(fit=fitted(part.A, part.C))
-    part = _with_integrators(part, *dynamics(len(part.A)), seen, settings.unstable, fitted)
+    part = _with_integrators(
+        part, *dynamics(len(part.A)), seen, settings.unstable, fitted, spare=len(orders) > 1
+    )
     if trend in FILTERED:
         return _on_levels(part, own)
     return _without_idle_constant(part, seen, settings.feedthrough) if trend == "constant" else part
 
 
-def _smallest(error: Callable[[int], float], orders: Sequence[int]) -> int:
-    """The smallest order whose error is nearly the least; every order up to six is tried, every second or third
-    beyond, and those below the one that these point to.
+def _likeliest(left: Callable[[int], Sequence[Array]], orders: Sequence[int], inputs: int) -> int:
+    """The order of the least Schwarz criterion, from what each leaves of the records.
+
+    Every order up to six is tried, every second or third beyond, and those beside the one that these point to.
+    Residuals count as so many samples as they amount to, given how the fullest model's are correlated.
     """
     coarse = [n for k, n in enumerate(orders) if k < 6 or (k < 12 and k % 2) or k % 3 == 1 or n == orders[-1]]
-    best = min(map(error, coarse))
-    found = next(n for n in coarse if error(n) <= NEAR_BEST * best)
-    below = [n for n in orders if n < found and n > max((c for c in coarse if c < found), default=0)]
-    return next((n for n in below if error(n) <= NEAR_BEST * best), found)
+    if len(coarse) == 1:
+        return coarse[0]
+
+    def variance(n: int) -> Array:
+        mean: Array = np.mean(np.concatenate(left(n)) ** 2, axis=0)
+        return np.log(np.maximum(mean, ROUNDING**2))
+
+    fullest = left(min(coarse, key=lambda n: variance(n).sum()))
+    outputs = fullest[0].shape[1]
+    samples = np.array(
+        [max(independent_samples([one[:, i : i + 1] for one in fullest]), 1.0) for i in range(outputs)]
+    )
+    price = (inputs + outputs) * np.log(samples.sum())
+    information = cache(lambda n: float(samples @ variance(n) + price * n))
+    at = coarse.index(min(coarse, key=information))
+    lower, upper = coarse[max(at - 1, 0)], coarse[min(at + 1, len(coarse) - 1)]
+    return min((n for n in orders if lower <= n <= upper), key=information)
 
 
 def _with_integrators(
-    found: Part, A: Array, C: Array, records: Scaled, unstable: str, fitted: Callable[..., InputFit]
+    found: Part,
+    A: Array,
+    C: Array,
+    records: Scaled,
+    unstable: str,
+    fitted: Callable[..., InputFit],
+    *,
+    spare: bool,
 ) -> Part:
-    """As many slow poles moved to one as the records do not contradict; see `integrators`."""
+    """As many slow poles moved to one as the records do not contradict; see `integrators`.
+
+    Those that explain no more than chance does, by Schwarz's criterion, are left out if `spare`: a disturbance that
+    walks passes for them.
+    """
     counts = near_one(A, max(map(len, records.u)))
     if not counts:
         return found
@@ -148,6 +186,14 @@ def _with_integrators(
         A1, C1 = with_integrators(A, C, q)
         A1, stabilised = inside_unit_circle(A1, unstable, q)
         fit = fitted(A1, C1, q)
+        if spare and q < len(A1):
+            rest = found._replace(
+                A=A1[q:, q:], C=C1[:, q:], stabilised=stabilised, fit=fitted(A1[q:, q:], C1[:, q:])
+            )
+            N = independent_samples(residuals(A1, C1, fit, records))
+            worth = q * (len(C1) + records.u[0].shape[1]) * np.log(max(N, 2.0))
+            if N * ((rest.fit.error / max(fit.error, 1e-300)) ** 2 - 1.0) <= worth:
+                return rest
         if explains_as_well(fit.error, free.error, independent_samples(residuals(A1, C1, fit, records))):
             part = found._replace(A=A1, C=C1, integrators=q, stabilised=stabilised, fit=fit)
             return _without_leaks(part, records, fitted)
