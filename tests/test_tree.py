@@ -392,3 +392,25 @@ def test_the_tree_proves_what_the_table_does_in_any_units(seed, monkeypatch):
         by_tree = decide(*drawn_case(seed, scale))
         assert by_tree.status is by_table.status is Status.OPTIMAL
         assert by_tree.objective == pytest.approx(by_table.objective, rel=1e-7)
+
+
+def sized_case(seed):
+    """A case with least sizes and a price, mostly nearer to where it should be."""
+    rng = np.random.default_rng([seed, 9])
+    problem, rules, x, reference = drawn_case(seed, (1.0, 1e-4, 1e3)[seed % 3])
+    limits, m = problem.limits, problem.model.n_inputs
+    most = np.minimum(limits.u_max - limits.u_min, limits.du_max)
+    size = rng.uniform(0.02, (0.3, 0.9)[seed % 2], m) * most * (rng.random(m) < 0.8)
+    price = rules.price if rng.random() < 0.3 else 10.0 ** rng.uniform(-2, 0.5)
+    if rng.random() < 0.6:
+        x, reference = 0.1 * x, problem.model.y_op + rng.uniform(0, 0.4) * (reference - problem.model.y_op)
+    return problem, replace(rules, min_size=size, price=price), x, reference
+
+
+@pytest.mark.parametrize("seed", [136, 140, 320, 321, 374, 416, 435, 526, *seeds(100, quick=8)])
+def test_least_sizes_are_proven_alike_by_table_and_tree(seed, monkeypatch):
+    by_tree = decide(*sized_case(seed))
+    monkeypatch.undo()
+    by_table = decide(*sized_case(seed))
+    assert by_tree.status is by_table.status is Status.OPTIMAL
+    assert by_tree.objective == pytest.approx(by_table.objective, rel=1e-9)

@@ -74,11 +74,12 @@ class OpenPatterns:
             self._table, self._values = self._table[open_], self._values[:, open_]
         if not len(self.rows):
             return
-        values = self._take(cost)
-        values += self._charge
-        if self._ranking.admissible.sized:
+        values, gained = self._take(cost)
+        if self._ranking.admissible.sized:  # what least sizes add is known with the new multipliers alone
             x = self._held[-1:, : len(cost.target)]
-            values += self._ranking.lift(x, self.rows)[:, 0]
+            gained = np.maximum(gained, self._ranking.lift(x, self.rows)[:, 0])
+        values += gained
+        values += self._charge
         np.maximum(self.bounds, values, out=self.bounds)
 
     def _begin(self, open_: BoolArray) -> None:
@@ -96,8 +97,8 @@ class OpenPatterns:
         self._values = without[None] + sample.cost
         self._rounding = 2 * ranking.rounding(x)
 
-    def _take(self, cost: LeastSquares) -> Array:
-        """Take up some multipliers; what patterns cost at least with them, and on the way to earlier ones."""
+    def _take(self, cost: LeastSquares) -> tuple[Array, Array]:
+        """Take up multipliers; what patterns cost at least with them, and how much more on the way to earlier ones."""
         assert self._table is not None
         ranking, (K, n) = self._ranking, self._table.shape[:2]
         x, shift = ranking.scaled(cost), cost.target - self._sample.target
@@ -123,6 +124,4 @@ class OpenPatterns:
         slope *= share
         self._held = np.concatenate((self._held, new[None]))
         self._values = np.concatenate((self._values, value[None]))
-        best: Array = value + np.maximum(np.maximum.reduce(slope), 0.0)
-        best -= self._rounding
-        return best
+        return value - self._rounding, np.maximum(np.maximum.reduce(slope), 0.0)
