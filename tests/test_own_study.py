@@ -33,6 +33,7 @@ MODELS = {
         names=mampc.Names(("feed",), ('level "A"\\',), disturbances=("draw",)),
     ),
     "unstable": StateSpace([[1.05]], [[0.5]], [[1.0]], None, 1.0),
+    "unstable beside a slow lag": StateSpace([[1.15, 0.3], [0.0, 0.98]], [[0.5], [0.1]], [[1.0, 0.0]], None, 1.0),
     "fewer inputs": lags(gain=[[1.0], [-2.0], [0.0]], time_constant=[[10.0], [30.0], [1.0]], dt=4.0),
     "more inputs": lags(gain=[[1.0, 2.0, 0.0]], time_constant=[[10.0, 20.0, 30.0]], dt=4.0),
     "at once": StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[3.0]], 1.0),

@@ -13,6 +13,7 @@ from mampc.cli import app
 from mampc.compare import candidates, scenarios, tuning
 from mampc.compare.scenarios import even_weight, scenario_length, settling, usual_problem
 from mampc.compare.tuned_study import study_of_model, with_tuning
+from mampc.program.condensing import CondensedQP
 from mampc.study import load_study, parse_study
 from mampc.study.regulators import regulator_of
 from mampc.study.running import run_study
@@ -364,3 +365,14 @@ def test_a_slider_has_a_middle(tank):
     for positions in (1, 4):
         with pytest.raises(mampc.MampcError, match="positions: expected"):
             tank.bank(positions)
+
+
+@pytest.mark.parametrize("late", [0, 12])
+def test_plain_mpc_of_an_unstable_model_looks_no_further_than_its_errors_grow_tenfold(late):
+    A, B = np.eye(2 + late, k=1), np.eye(2 + late)[:, -1:]
+    A[:2, :3] = np.array([[1.04, 0.1, 0.0], [0.0, 0.7, 1.0]])[:, : 2 + min(late, 1)]
+    model = mampc.StateSpace(A, B, np.eye(2 + late)[:1], None, 2.0)
+    problem = usual_problem(model, mampc.Limits(u_min=-1.0, u_max=1.0), 1.0)
+    assert problem.prediction_horizon == 59  # 1.04**59 > 10
+    assert scenario_length(problem) <= 295
+    assert np.abs(CondensedQP(problem).closed_loop_poles()).max() < 0.99

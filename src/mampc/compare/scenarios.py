@@ -22,6 +22,7 @@ from mampc.loop.regulator import Regulator
 from mampc.program.problem import Limits, TrackingProblem
 from mampc.systems.mismatch import Mismatch
 from mampc.systems.noise import white_noise
+from mampc.systems.properties import growth, samples_to_grow
 from mampc.systems.state_space import StateSpace
 
 SETTLED = 0.05  # share of a step response's largest value that may be missing where it has settled
@@ -139,7 +140,12 @@ def even_weight(model: StateSpace, limits: Limits) -> Array:
 
 
 def settling(model: StateSpace) -> int:
-    """Samples until every step response stays where it leads; of models that integrate, until its slope does."""
+    """Samples until every step response stays where it leads; of models that integrate, until its slope does; of
+    unstable ones, until errors have grown tenfold.
+    """
+    growing = samples_to_grow(model)
+    if growing is not None:
+        return min(growing, LONGEST_SETTLING)
     response = model.step_response(LONGEST_SETTLING + 1)[:, :, : model.n_inputs]
     if np.abs(model.poles()).max(initial=0.0) > 1 - 1e-6:
         response = np.diff(response, axis=0)
@@ -154,6 +160,7 @@ def dead_samples(model: StateSpace) -> int:
     response = np.abs(model.step_response(LONGEST_SETTLING + 1)[:, :, : model.n_inputs])
     if not np.isfinite(response).all():
         return 0
+    response /= growth(model) ** np.arange(len(response))[:, None, None]
     begun = (response > BEGUN * response.max(axis=0)).argmax(axis=0)
     return int(max(begun.max(initial=0) - 1, 0))
 

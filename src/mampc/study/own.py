@@ -18,7 +18,7 @@ from mampc.base.errors import MampcError, listed
 from mampc.controllers.offset import HIGHEST_PRICE, highest_price
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import MOST_PREDICTIONS, Limits, TrackingProblem
-from mampc.systems.properties import Properties, properties, time_in_words
+from mampc.systems.properties import Properties, properties, samples_to_grow, time_in_words
 from mampc.systems.state_space import StateSpace
 
 LONGEST_HORIZON = 100  # samples; beyond it the tail counts
@@ -67,6 +67,9 @@ def draft(model: StateSpace, found: Properties) -> Draft:
     dead = int(np.ceil(found.dead_time[:, :m].max(initial=0.0) / model.dt))
     moves = 5 if m < 3 else 4 if m == 3 else 3
     horizon = min(max(settling, SHORTEST_HORIZON), LONGEST_HORIZON)
+    growing = samples_to_grow(model)
+    if growing is not None:
+        horizon = min(horizon, max(growing, SHORTEST_HORIZON))
     horizon = min(max(horizon, dead + 2 * moves), MOST_PREDICTIONS // l)
     gain = _held_gain(model, found, horizon)
     if not gain.any():

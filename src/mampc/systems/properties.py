@@ -19,11 +19,13 @@ from mampc.systems.state_space import StateSpace, as_discrete
 
 LASTS = 1e-9  # distance from the unit circle of modes that do not decay
 SEEN = 0.02  # of a channel's largest change: what ends its dead time, and what is left when it has settled
+GROWS = 1e-6  # a pole's size beyond one from where on it makes a model unstable
 RISEN = 1 - np.exp(-1.0)  # of the way, after one time constant
 LONGEST = 2**13  # samples of a response
 NEGLIGIBLE = 1e-9  # of the largest in its row and column: a channel of rounding alone
 MOST_FOR_ZEROS = 200  # states
 MATTERS = 0.1  # of the largest effect on an output: what an input may do to it unnoticed
+GROWN = 10.0  # times that errors of an unstable model may grow within a prediction horizon
 SINGULAR = 1e-6  # of the gain about it: the gain at a zero
 
 
@@ -96,6 +98,21 @@ def properties(model: StateSpace) -> Properties:
         condition=condition,
         limiting_zeros=_limiting(model),
     )
+
+
+def growth(model: StateSpace) -> float:
+    """By how much errors of an unstable discrete model grow in a sample; 1 for every other model."""
+    largest = float(np.abs(model.poles()).max(initial=0.0))
+    return largest if largest > 1 + GROWS else 1.0
+
+
+def samples_to_grow(model: StateSpace) -> int | None:
+    """Samples in which errors of an unstable model grow `GROWN` times: a horizon that sees more sees little else.
+
+    None for a model that is not unstable.
+    """
+    each = growth(model)
+    return None if each == 1.0 else int(np.ceil(np.log(GROWN) / np.log(each)))
 
 
 def _apart(model: StateSpace) -> tuple[StateSpace, StateSpace]:
