@@ -4,6 +4,8 @@
 """
 
 from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -80,6 +82,11 @@ class FaultyLoop(RuleBasedStateMachine):
         self.y_last, self.v_last = self.model.y_op, self.model.v_op
         self.reference, self.present, self.manual = self.model.y_op, None, None
         self.held, self.fresh, self.variant = False, False, None
+        self.recorder = None
+        if seed % 3 == 0:
+            self.folder = TemporaryDirectory()
+            self.recorder = mampc.Recorder(Path(self.folder.name) / "loop.csv", self.regulator)
+            self.statuses = set()
 
     @property
     def history(self):
@@ -195,6 +202,12 @@ class FaultyLoop(RuleBasedStateMachine):
     def teardown(self):
         if getattr(self, "sound", False):  # else a step failed half-way
             self.recover()
+            if self.recorder is not None and Status.TIME_LIMIT not in self.statuses:
+                recording = mampc.Recording.from_csv(self.recorder.path, self.model.names)
+                assert mampc.replay(self.loop.build(), None, recording, tolerance=0.0) is None
+        if getattr(self, "recorder", None) is not None:
+            self.recorder.close()
+            self.folder.cleanup()
 
     def measured(self):
         """What healthy sensors show of the plant; a plant that ran away is started again."""
@@ -217,7 +230,11 @@ class FaultyLoop(RuleBasedStateMachine):
             "u_applied": u_applied, "measured_disturbance": v, "limits": self.present, "manual": self.manual,
             "variant": self.variant,
         }  # fmt: skip
-        decision = self.regulator.step(self.state, y, self.reference, **arguments)
+        if self.recorder is None:
+            decision = self.regulator.step(self.state, y, self.reference, **arguments)
+        else:
+            decision = self.recorder.step(self.state, y, self.reference, **arguments)
+            self.statuses.add(decision.status)
         STEPPED[decision.status] += 1
 
         text = decision.state.to_json()
