@@ -1,6 +1,6 @@
 """Valves that stick: how often stems start at equal error, with and without compensation.
 
-    python benchmarks/valves.py             # prints the figures of docs/methods.md; about a minute
+    python benchmarks/valves.py             # prints the figures of docs/methods.md; some minutes
     python benchmarks/valves.py --seeds 2   # fewer loads
 
 The study `examples/sticking-valves.toml` (the quadruple tank, loads that jump, noise, valves with a band of 2
@@ -25,7 +25,7 @@ from mampc.study import Study, load_study
 from mampc.study.running import Prepared, prepare, regulator_of, run_seeds
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "sticking-valves.toml"
-PRICES = (0.03, 0.1, 0.3, 1.0, 3.0)
+PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
 NAMES = ("price", "price, compensated")
 
 

@@ -1,6 +1,6 @@
 """Zones against set points: moves at equal time outside the zone.
 
-    python benchmarks/zones.py            # prints the figures of docs/methods.md; about a minute
+    python benchmarks/zones.py            # prints the figures of docs/methods.md; some minutes
     python benchmarks/zones.py --figure   # and draws docs/images/zones.svg
     python benchmarks/zones.py --plant tank    # the same on the quadruple tank; or level
     python benchmarks/zones.py --kalman   # with one Kalman filter in place of the load bank
