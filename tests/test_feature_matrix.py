@@ -21,6 +21,7 @@ ROWS = {
     "reference filter": {},
     "bank": {},
     "valves": {},
+    "limits, manual": {},
 }  # fmt: skip
 RULES = {
     "levels": {"levels": [[0.0, 1.0, 2.0, 2.5, 4.0], 0.5]},
@@ -87,11 +88,19 @@ def asked(feature, steps=STEPS):
 
 
 def told(feature):
+    if feature == "limits, manual":
+        manual = np.full((STEPS, 2), np.nan)
+        manual[3:5, 0] = 1.0
+        limits = [None, *[mampc.Limits(u_max=[1.5, 3.0])] * (STEPS - 1)]
+        return {"noise": 0.05, "limits": limits, "manual": manual}
     return {"noise": 0.05, "valves": mampc.Valves(band=0.2, jump=0.05) if feature == "valves" else None}
 
 
 def ran(feature, regulator, steps=STEPS):
-    run = mampc.simulate(model(), regulator, asked(feature, steps), progress=False, **told(feature))
+    during = told(feature)
+    if "limits" in during:
+        during = during | {"limits": during["limits"][:steps], "manual": during["manual"][:steps]}
+    run = mampc.simulate(model(), regulator, asked(feature, steps), progress=False, **during)
     assert np.isfinite(run.u).all()
     assert (run.u >= -1e-9).all()
     assert (run.u <= 4.0 + 1e-9).all()
@@ -166,6 +175,10 @@ WORDS = {
         "CONTROLLER": '[[controllers]]\nname = "plain"\nmethod = "mpc"\n[[controllers]]\nname = "both"\n'
         'method = "bank"\nvariants = ["own", "plain"]',
     },
+    "limits, manual": {
+        "SCENARIO": "limits = [{ at = 2, u_max = [1.5, 3.0] }]\n"
+        'manual = [{ at = 3, until = 5, input = "INPUT", value = 1.0 }]',
+    },
     "valves": {"SCENARIO": "valves = { band = 0.2, jump = 0.05 }", "CONTROLLER": "compensate = true"},
 }  # fmt: skip
 
@@ -175,6 +188,7 @@ def studied(feature, tmp_path):
     text = STUDY
     for key in ("PROBLEM", "REFERENCE", "SCENARIO", "RULES", "CONTROLLER"):
         text = text.replace(key, WORDS[feature].get(key, ""))
+    text = text.replace("INPUT", model().names.inputs[0])
     result = run_study(parse_study(text, folder=tmp_path))
     assert all(len(run.decisions) == 8 for run in result.runs["one"].values())
 

@@ -19,6 +19,7 @@ from mampc.study.running import Prepared, load_of
 from mampc.study.scenario_tables import (
     LOADS,
     ChangeTable,
+    LimitsTable,
     LoadTable,
     MismatchTable,
     ReferenceTable,
@@ -27,7 +28,6 @@ from mampc.study.scenario_tables import (
 from mampc.study.schema import (
     ControllerTable,
     EstimatorTable,
-    LimitsTable,
     ModelTable,
     PlantTable,
     ProblemTable,

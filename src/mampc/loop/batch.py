@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -25,6 +25,7 @@ from mampc.loop.run import Run
 from mampc.loop.simulation import Acting, acting_on
 from mampc.loop.valves import Valves
 from mampc.plants import Plant
+from mampc.program.problem import Limits
 from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
 
@@ -51,7 +52,7 @@ class Batch:
         names: of the inputs and outputs.
         resolution: of each loop's inputs, as in `Run`, shape (S, m).
         zone: of each loop, as in `Run`.
-        zone_told: as in `Run`.
+        zone_told, told: as in `Run`.
     """
 
     t: Array
@@ -70,6 +71,7 @@ class Batch:
     resolution: Array
     zone: tuple[Zone | None, ...]
     zone_told: bool
+    told: tuple[Mapping[str, Any], ...]
 
     def __len__(self) -> int:
         return len(self.u)
@@ -79,7 +81,7 @@ class Batch:
         own = (
             "u", "y", "y_measured", "r", "u_initial", "v", "position", "faults", "decisions", "resolution", "zone"
         )  # fmt: skip
-        shared = ("t", "dt", "names", "zone_told")
+        shared = ("t", "dt", "names", "zone_told", "told")
         return Run(
             **{name: getattr(self, name)[loop] for name in own},
             **{name: getattr(self, name) for name in shared},
@@ -107,6 +109,8 @@ def simulate_batch(
     valves: Valves | None = None,
     u_initial: Any = None,
     variant: str | Sequence[str] | None = None,
+    limits: Limits | Sequence[Limits | None] | None = None,
+    manual: Any = None,
     keep_decisions: bool = False,
     progress: bool | None = None,
 ) -> Batch:
@@ -122,7 +126,7 @@ def simulate_batch(
         reference, steps, noise, preview, u_initial: as in `simulate`.
         seeds: of noise and loads, one per loop; they give the number S of loops.
         input_disturbance, output_disturbance, measured_disturbance: as in `simulate`.
-        variant: as in `simulate`.
+        variant, limits, manual: as in `simulate`, the same for all loops; with the latter two, loop by loop.
         loads, valves: as in `simulate`; loads are drawn for each loop with its seed.
         keep_decisions: keep every `Decision`; then regulators are stepped loop by loop, and memory grows with them.
         progress: as in `simulate`.
@@ -169,13 +173,13 @@ def simulate_batch(
         acting.append(
             acting_on(
                 plants[s], regulators[s], steps=steps, noise=noise, loads=loads, valves=valves, u_initial=u_initial,
-                variant=variant, **one,
+                variant=variant, limits=limits, manual=manual, **one,
             )
         )  # fmt: skip
     courses = [one.drawn(seed) for one, seed in zip(acting, seeds, strict=True)]
     keep = as_flag("keep_decisions", keep_decisions)
     first, plans = regulators[0], None
-    if not keep and all(_steps_like(own, first) for own in regulators):
+    if not keep and limits is None and manual is None and all(_steps_like(own, first) for own in regulators):
         ahead = preview or first.reference_filter is not None
         if not isinstance(reference, Zone) or first.reference_filter is None:
             plans = batched_plans([own._planner for own in regulators], ahead)
@@ -211,7 +215,7 @@ def simulate_batch(
         zone=tuple(
             course.ranges(own.controller) for course, own in zip(courses, regulators, strict=True)
         ),
-        zone_told=isinstance(reference, Zone),
+        zone_told=isinstance(reference, Zone), told=courses[0].told_beside(),
     )  # fmt: skip
 
 

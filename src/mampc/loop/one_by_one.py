@@ -61,6 +61,8 @@ def closed_loops(
             if stem is not None:
                 stem = stems[s] = stem.moved(decision.u)
             position[s] = decision.u if stem is None else stem.position
+            if course.interventions is not None:
+                position[s] = course.interventions.moved(k, position[s])
             decisions.append(decision._replace(state=None))
         applied = np.concatenate([position + at_inputs[k], v[k]], axis=1)
         x = motion.move(x, applied)

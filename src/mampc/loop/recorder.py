@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import warnings
-from dataclasses import dataclass, fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,32 +12,14 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array, as_instance, as_read, as_shaped
-from mampc.base.csv_table import CSVTable
-from mampc.base.errors import MampcError, MampcWarning, shown
-from mampc.base.names import Names
+from mampc.base.errors import MampcError, MampcWarning
 from mampc.controllers.decision import Decision
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import told_by
 from mampc.loop.state import RegulatorState
+from mampc.loop.told import told_cells, told_columns
 from mampc.program.problem import Limits
 from mampc.program.zone import Zone
-
-BESIDE = ("limits", "asked", "state")  # columns of a live loop that are JSON, or empty
-
-
-@dataclass(frozen=True, eq=False)
-class Live:
-    """What one sample of a live loop was told beside measurements, reference, disturbances and variant.
-
-    Attributes:
-        told: `u_applied`, `manual` and `limits`, as far as given, as `Regulator.step` takes them.
-        reference: given ahead, shape (np + 1, l), or a `Zone`; None where it was one of shape (l,).
-        state: from which the step began, as text; empty where that was the state after the sample before.
-    """
-
-    told: dict[str, Any]
-    reference: Array | Zone | None
-    state: str
 
 
 class Recorder:
@@ -84,7 +65,7 @@ class Recorder:
             "time", *names.inputs, *names.disturbances,
             *(f"{y}_measured" for y in names.outputs), *(f"{y}_reference" for y in names.outputs),
             "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored", "load",
-            "variant", *(f"{u}_applied" for u in names.inputs), *(f"{u}_manual" for u in names.inputs), *BESIDE,
+            "variant", *told_columns(names),
         ])  # fmt: skip
 
     def step(self, state: RegulatorState, y: Any, reference: Any, **told: Any) -> Decision:
@@ -128,24 +109,16 @@ class Recorder:
         manual: Any = None,
         variant: str | None = None,
     ) -> list[Any]:
-        none = [""] * self._m
         v = np.full(self._shapes, np.nan) if measured_disturbance is None else measured_disturbance
         asked, ahead = _asked(reference)
-        applied, flags = (
-            none if value is None else as_shaped(name, value, (self._m,)).tolist()
-            for name, value in (("u_applied", u_applied), ("manual", manual))
-        )
-        given = (
-            {} if limits is None else {field.name: getattr(limits, field.name) for field in fields(limits)}
-        )
-        present = {name: as_read(name, value).tolist() for name, value in given.items() if value is not None}
         return [
             self._samples * self._dt, *decision.u.tolist(),
             *as_shaped("measured_disturbance", v, self._shapes).tolist(),
             *as_shaped("y", y, (self._l,)).tolist(), *asked.tolist(),
             decision.status.value, decision.objective, decision.lower_bound, decision.iterations,
-            round(decision.solve_time * 1e6, 2), *told_by(decision).values(), *applied, *flags,
-            "" if limits is None else json.dumps(present), ahead, "" if state is self._last else state.to_json(),
+            round(decision.solve_time * 1e6, 2), *told_by(decision).values(),
+            *told_cells({"u_applied": u_applied, "manual": manual, "limits": limits}, self._m),
+            ahead, "" if state is self._last else state.to_json(),
         ]  # fmt: skip
 
 
@@ -157,41 +130,3 @@ def _asked(reference: Any) -> tuple[Array, str]:
         return centre if centre.ndim == 1 else centre[0], text
     rows = as_read("reference", reference)
     return (rows, "") if rows.ndim == 1 else (rows[0], json.dumps(rows.tolist()))
-
-
-def read_live(table: CSVTable, names: Names) -> tuple[Live, ...]:
-    """What the samples of a file were told beside what every trajectory has; none where no `Recorder` wrote it.
-
-    Raises:
-        MampcError: cells that are not what a `Recorder` writes.
-    """
-    if not set(BESIDE) <= set(table.header):
-        return ()
-    texts = {name: table.words(name) for name in BESIDE}
-    cells = {
-        kind: list(zip(*(table.words(f"{u}_{of}") for u in names.inputs), strict=True))
-        for kind, of in (("u_applied", "applied"), ("manual", "manual"))
-    }
-    rows = []
-    for k in range(len(table)):
-        told: dict[str, Any] = {}
-        try:
-            for kind, words in cells.items():
-                if any(words[k]):
-                    told[kind] = np.array([float(word) for word in words[k]])
-            if texts["limits"][k]:
-                told["limits"] = Limits(**json.loads(texts["limits"][k]))
-            reference = json.loads(texts["asked"][k]) if texts["asked"][k] else None
-            if isinstance(reference, dict):
-                reference = Zone(**reference)
-            elif reference is not None:
-                reference = as_read("asked", reference)
-        except (ValueError, TypeError, RecursionError):
-            cell = " ".join(
-                [texts["limits"][k], texts["asked"][k], *sum((words[k] for words in cells.values()), ())]
-            )
-            raise MampcError(
-                f"{table.path}: expected what a Recorder writes in sample {k}, received {shown(cell)}"
-            ) from None
-        rows.append(Live(told, reference, texts["state"][k]))
-    return tuple(rows)

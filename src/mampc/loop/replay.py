@@ -16,10 +16,10 @@ from mampc.base.checks import Array, as_number
 from mampc.base.csv_table import CSVTable
 from mampc.base.errors import MampcError
 from mampc.base.names import Names
-from mampc.loop.recorder import Live, read_live
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import ENDS, Run, told_by
 from mampc.loop.state import RegulatorState
+from mampc.loop.told import Live, read_live
 from mampc.program.zone import Zone
 
 SAME_DECISION = 1e-9  # relative to the size of a number, at least one unit
@@ -42,7 +42,7 @@ class Recording:
         variant: which controller of a `ControllerBank` decided, by name; empty words where there is none.
         names: of the signals.
         zone: told in place of the references, ends of shape (T, l); None where none was.
-        live: of a `Recorder`, what each sample of a live loop was told beside that; none of a simulated run.
+        live: what each sample was told beside that; none where nothing was.
     """
 
     t: Array
@@ -83,6 +83,7 @@ class Recording:
             variant,
             run.names,
             run.zone if run.zone_told else None,
+            tuple(Live(dict(told), None, "") for told in run.told),
         )
 
     @classmethod
@@ -125,7 +126,7 @@ class Recording:
         if ahead is not None:
             return ahead
         part: Any = k
-        if samples is not None and not self.live:
+        if samples is not None and not (self.live and self.live[0].state):  # a simulated run
             part = np.minimum(np.arange(k, k + samples), len(self.t) - 1)
         return self.r[part] if self.zone is None else Zone(self.zone.low[part], self.zone.high[part])
 

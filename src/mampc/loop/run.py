@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from mampc.base.tolerances import SAME
 from mampc.controllers.decision import Decision
 from mampc.loop import metrics
 from mampc.loop.metrics import Metrics
+from mampc.loop.told import told_cells, told_columns
 from mampc.program.problem import Limits
 from mampc.program.zone import Zone
 
@@ -45,6 +47,8 @@ class Run:
         dt: sample time in seconds.
         names: of the inputs and outputs.
         zone: within which outputs cost nothing, ends of shape (T, l); None where all have set points.
+        told: what the regulator was told of limits, inputs in manual and applied inputs at each sample; empty where
+            that was nothing.
         zone_told: whether the regulator was told this zone in place of the reference, which then is its middle.
         resolution: changes up to here are rounding and no moves, in input units, shape (m,), as in `Decision`; 1e-9
             unless the controller says otherwise.
@@ -65,6 +69,7 @@ class Run:
     resolution: Array = None  # type: ignore[assignment]  # as above
     zone: Zone | None = None
     zone_told: bool = False
+    told: tuple[Mapping[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         if self.resolution is None:
@@ -121,8 +126,8 @@ class Run:
 
     def to_csv(self, path: str | Path) -> None:
         """Write time, decided inputs, measured disturbances, outputs, references, status, remarks, ignored outputs,
-        what loads seem to do and variant, in full precision; and where the actuators were, if not as told, and the
-        ends of the zone, if it was told.
+        what loads seem to do and variant, in full precision; and where the actuators were, if not as told, the
+        ends of the zone, if it was told, and limits and inputs in manual, if there were some.
         """
         if len(self.decisions) != len(self.t):
             raise MampcError(
@@ -136,7 +141,7 @@ class Run:
             "load", "variant",
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
-        positions: list[list[float]] = [[] for _ in self.t]
+        positions: list[list[Any]] = [[] for _ in self.t]
         if not np.array_equal(self.position, self.u):
             header += [f"{u}_position" for u in inputs]
             positions = self.position.tolist()
@@ -144,6 +149,10 @@ class Run:
             header += [f"{y}_{end}" for end in ENDS for y in outputs]
             ends = np.hstack([self.zone.low, self.zone.high]).tolist()
             positions = [own + row for own, row in zip(positions, ends, strict=True)]
+        if self.told:
+            header += told_columns(self.names)
+            cells = [[*told_cells(told, len(inputs)), "", ""] for told in self.told]
+            positions = [own + row for own, row in zip(positions, cells, strict=True)]
         with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)

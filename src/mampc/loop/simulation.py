@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from mampc.base.names import Names
 from mampc.base.progress import watched
 from mampc.controllers.bank import ControllerBank
 from mampc.controllers.controller import Controller
+from mampc.loop.interventions import Interventions
 from mampc.loop.loads import Load, drawn
 from mampc.loop.motion import Faults, motion_of
 from mampc.loop.regulator import Regulator
@@ -21,6 +22,7 @@ from mampc.loop.run import Run
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Stems, Valves
 from mampc.plants import Plant
+from mampc.program.problem import Limits
 from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
 
@@ -43,6 +45,8 @@ def simulate(
     valves: Valves | None = None,
     u_initial: Any = None,
     variant: str | Sequence[str] | None = None,
+    limits: Limits | Sequence[Limits | None] | None = None,
+    manual: Any = None,
     progress: bool | None = None,
 ) -> Run:
     """Run a regulator on a plant that starts at rest.
@@ -63,6 +67,9 @@ def simulate(
         valves: what stands between decided and real inputs (see `Valves`); default inputs are as decided.
         u_initial: inputs at the start, shape (m,); default the plant's usual ones (its `u_op`).
         variant: of a `ControllerBank`, one name or one for each sample; default its first.
+        limits: that the regulator is told (see `Regulator.step`), one for all samples, or one or None for each.
+        manual: inputs that somebody else moves, and where to, (m,) or (T, m), not-a-number where they are in automatic.
+            The regulator is told which, and at the next sample where they were.
         progress: show a progress bar on the terminal; default: when the run is long.
 
     Raises:
@@ -72,7 +79,7 @@ def simulate(
         plant, regulator, reference, steps=steps, noise=noise,
         input_disturbance=input_disturbance, output_disturbance=output_disturbance,
         measured_disturbance=measured_disturbance, loads=loads, valves=valves, u_initial=u_initial,
-        variant=variant,
+        variant=variant, limits=limits, manual=manual,
     ).drawn(seed)  # fmt: skip
     return closed_loop(plant, regulator, course, preview=preview, progress=progress)
 
@@ -90,6 +97,7 @@ class Course:
         u_initial: inputs before the first sample, shape (m,).
         stems: the valves at these inputs; None where inputs are as decided.
         variants: of a `ControllerBank`, a name for each sample; None for its first.
+        interventions: of operators; None where they do nothing.
     """
 
     reference: Array
@@ -101,6 +109,7 @@ class Course:
     u_initial: Array
     stems: Stems | None
     variants: Sequence[str] | None
+    interventions: Interventions | None
 
     def asked(self, k: int, samples: int | None) -> Array | Zone:
         """What the regulator is asked for at sample k: of this one, or of so many from it on where it sees ahead."""
@@ -128,7 +137,13 @@ class Course:
     def told(self, k: int, v: Array | None) -> dict[str, Any]:
         """What the regulator is told at a sample beside measurements and reference; v its measured disturbances."""
         told: dict[str, Any] = {} if v is None else {"measured_disturbance": v}
+        if self.interventions is not None:
+            told |= self.interventions.told(k)
         return told if self.variants is None else told | {"variant": self.variants[k]}
+
+    def told_beside(self) -> tuple[Mapping[str, Any], ...]:
+        """What all samples are told of interventions; none where there are none."""
+        return () if self.interventions is None else tuple(map(self.interventions.told, range(len(self))))
 
     def __len__(self) -> int:
         return len(self.noise)
@@ -140,7 +155,7 @@ class Acting:
 
     Attributes:
         dt: sample time in seconds.
-        reference, zone, u_initial, stems, variants: as in `Course`.
+        reference, zone, u_initial, stems, variants, interventions: as in `Course`.
         spread: standard deviation of the noise, shape (l,).
         at: disturbances by place, shapes (T, m), (T, l) and (T, d).
         loads: to be drawn.
@@ -155,6 +170,7 @@ class Acting:
     u_initial: Array
     stems: Stems | None
     variants: Sequence[str] | None
+    interventions: Interventions | None
 
     def drawn(self, seed: int) -> Course:
         """With noise and loads of a seed."""
@@ -174,6 +190,7 @@ class Acting:
             self.u_initial,
             self.stems,
             self.variants,
+            self.interventions,
         )
 
 
@@ -191,6 +208,8 @@ def acting_on(
     valves: Valves | None,
     u_initial: Any,
     variant: str | Sequence[str] | None = None,
+    limits: Limits | Sequence[Limits | None] | None = None,
+    manual: Any = None,
 ) -> Acting:
     """What the arguments of `simulate` say, checked."""
     as_instance("regulator", regulator, Regulator)
@@ -231,11 +250,16 @@ def acting_on(
     }
     if valves is not None:
         as_instance("valves", valves, Valves)
+    if valves is not None and manual is not None:
+        raise MampcError(
+            "manual: expected none beside valves, whose stems nobody else moves here, received some"
+        )
     start = as_vector("u_initial", _default(u_initial, getattr(plant, "u_op", model.u_op)), m)
     return Acting(
         dt=model.dt, reference=rows[ahead], zone=zone, spread=spread, at=at,
         loads=loads, u_initial=start, stems=None if valves is None else valves.initial(start),
         variants=_variants(variant, T, regulator.controller),
+        interventions=Interventions.of(limits, manual, T, regulator.controller),
     )  # fmt: skip
 
 
@@ -271,6 +295,8 @@ def closed_loop(
         if stems is not None:
             stems = stems.moved(decision.u)
             position = stems.position
+        if course.interventions is not None:
+            position = course.interventions.moved(k, position)
         positions[k] = position
         decisions.append(decision._replace(state=None))
         applied = np.concatenate([position + course.at_inputs[k], v[k]])
@@ -282,7 +308,7 @@ def closed_loop(
         t=np.arange(T) * model.dt, u=inputs, y=outputs, y_measured=outputs + course.noise, r=course.reference[:T],
         u_initial=start, decisions=tuple(decisions), dt=model.dt, names=plant.names, v=v, faults=found,
         position=positions, resolution=regulator.controller.resolution, zone=course.ranges(regulator.controller),
-        zone_told=course.zone is not None,
+        zone_told=course.zone is not None, told=course.told_beside(),
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from mampc.loop.simulation import Course, acting_on, at_rest, closed_loop
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Valves
 from mampc.plants import Plant
+from mampc.program.problem import Limits
 from mampc.program.zone import Zone
 from mampc.study.cautions import cautions
 from mampc.study.plugins import make_plant
@@ -208,7 +209,35 @@ def _acting(study: Study, prepared: Prepared, scenario: ScenarioTable) -> dict[s
         "loads": [load_of(study, model, table) for table in scenario.loads],
         "valves": None if scenario.valves is None else Valves(**scenario.valves.model_dump()),
         "u_initial": prepared.u_op,
+        "limits": _limits(study, scenario),
+        "manual": _manual(study, prepared, scenario),
     }
+
+
+def _limits(study: Study, scenario: ScenarioTable) -> list[Limits | None] | None:
+    """Limits of each sample, None for those of the problem."""
+    if not scenario.limits:
+        return None
+    each: list[Limits | None] = [None] * study.steps
+    for table in sorted(scenario.limits, key=lambda table: table.at):
+        told = table.model_dump(exclude={"at"}, exclude_none=True)
+        each[table.at :] = [Limits(**told) if told else None] * len(each[table.at :])
+    return each
+
+
+def _manual(study: Study, prepared: Prepared, scenario: ScenarioTable) -> Array | None:
+    """Where inputs are put by hand, shape (T, m), not-a-number in automatic; None where none is."""
+    if not scenario.manual:
+        return None
+    names = prepared.plant.names.inputs
+    rows = np.full((study.steps, len(names)), np.nan)
+    for table in scenario.manual:
+        if table.input not in names:
+            raise StudyError(
+                f"scenarios, {scenario.name!r}, manual: expected one of {', '.join(names)}, received {table.input!r}"
+            )
+        rows[table.at : table.until, names.index(table.input)] = table.value
+    return rows
 
 
 def load_of(study: Study, model: StateSpace, table: LoadTable) -> Load:

@@ -111,6 +111,29 @@ class SwitchTable(Table):
     variant: Word
 
 
+class LimitsTable(Table):
+    u_min: Values | None = None
+    u_max: Values | None = None
+    du_max: Values | None = None
+    y_min: Values | None = None
+    y_max: Values | None = None
+
+
+class LimitsNowTable(LimitsTable):
+    """From a sample on, other limits than those of the problem; none for these again."""
+
+    at: Whole
+
+
+class ManualTable(Table):
+    """An input that somebody moves by hand, from a sample on and up to another one."""
+
+    at: Whole
+    until: Whole
+    input: Word
+    value: Number
+
+
 class ScenarioTable(Table):
     name: Name
     noise: Values = 0.0
@@ -123,3 +146,5 @@ class ScenarioTable(Table):
     valves: ValvesTable | None = None
     mismatch: MismatchTable | None = None
     switches: list[SwitchTable] = []
+    limits: list[LimitsNowTable] = []
+    manual: list[ManualTable] = []

@@ -18,7 +18,7 @@ from mampc.plants import Level, QuadrupleTank, SolidOxideFuelCell, VanDeVusse, o
 from mampc.program.levels import OnOff
 from mampc.program.problem import LONGEST_HORIZON
 from mampc.rivals.registry import RIVALS, RULES, check_settings
-from mampc.study.scenario_tables import ReferenceTable, ScenarioTable
+from mampc.study.scenario_tables import LimitsTable, ReferenceTable, ScenarioTable
 from mampc.study.values import (
     LONGEST_EXCITATION,
     LONGEST_RUN,
@@ -77,14 +77,6 @@ class IdentificationTable(Table):
                 f"at most {LONGEST_EXCITATION} samples of excitation; received prbs_order and hold for {samples}"
             )
         return self
-
-
-class LimitsTable(Table):
-    u_min: Values | None = None
-    u_max: Values | None = None
-    du_max: Values | None = None
-    y_min: Values | None = None
-    y_max: Values | None = None
 
 
 class ProblemTable(Table):
