@@ -344,8 +344,8 @@ def test_prices_of_moves_that_can_be_large_take_one_relaxed_program(monkeypatch)
     assert 0 < len(rounds) <= ROUNDS
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_where_a_second_move_does_not_pay_single_moves_are_priced_at_once(seed, monkeypatch):
+@pytest.mark.parametrize(("seed", "size"), [*product(range(4), (0.0, 0.05)), (1, 0.2)])
+def test_where_a_second_move_does_not_pay_single_moves_are_priced_at_once(seed, size, monkeypatch):
     problem = random_problem(seed, n_c=6)
     x, reference = np.zeros(3), problem.model.y_op + 0.1
     mpc = mampc.MPC(problem)
@@ -353,8 +353,8 @@ def test_where_a_second_move_does_not_pay_single_moves_are_priced_at_once(seed, 
     hold = decide(problem, mampc.MoveRules(price=1e3), x, reference).objective
     price = 0.55 * (hold - free)
     monkeypatch.setattr(tree, "children_of", lambda *_: pytest.fail("a node was split"))
-    decision = decide(problem, mampc.MoveRules(price=price), x, reference)
-    one = decide(problem, mampc.MoveRules(max_moves=1), x, reference).objective
+    decision = decide(problem, mampc.MoveRules(price=price, min_size=size), x, reference)
+    one = decide(problem, mampc.MoveRules(max_moves=1, min_size=size), x, reference).objective
     assert decision.status is Status.OPTIMAL
     assert decision.objective == pytest.approx(min(hold, one + price), rel=1e-9)
 

@@ -142,8 +142,9 @@ class _BatchSearch:
         self._problem, self._of, self._terms = problem, problem.admissible, problem.terms
         self._squares, self._order = problem.squares, problem.order
         self._left_at_root = problem.allowance.left
-        # Nodes that get one move more at most need no descendants: all last moves are priced at once.
-        self._resolves = not (self._of.sized or self._of.simultaneous or self._squares.refined)
+        # Nodes that get one move more at most need no descendants: all last moves are priced at once. Beside a least
+        # size only the first move is, whose sign its program finds.
+        self._resolves = not (self._of.simultaneous or self._squares.refined)
         # Another move never costs more: then only patterns that spend the whole budget are of interest.
         self._nested = self._of.simple and not (
             self._of.priced or self._of.sized or any(problem.allowance.frozen)
@@ -178,6 +179,8 @@ class _BatchSearch:
             ended = nodes.used >= self._left_at_root - self._resolves
             if self._resolves and self._of.priced:
                 ended |= self._bound_of(level, nodes, 2) >= problem.cutoff  # two more moves do not pay
+            if self._of.sized:
+                ended &= nodes.width == 0
             if ended.any() and (self._resolves or self._nested):
                 if self._resolves:
                     self._try_last_moves(level, nodes.take(ended))
@@ -292,7 +295,10 @@ class _BatchSearch:
         chosen[:, : leaves.chosen.shape[1]] = leaves.chosen[rows]
         chosen[np.arange(len(rows)), nodes.width[rows]] = level + columns
         bound = np.maximum(bound[rows, columns], nodes.bound[rows])
-        self._try_all(Leaves(chosen, charge[rows, columns], leaves.low[rows], leaves.high[rows], bound))
+        low, high = leaves.low[rows], leaves.high[rows]
+        if of.sized:
+            low, high = (of_move[chosen] for of_move in (self._problem.domain.low, self._problem.domain.high))
+        self._try_all(Leaves(chosen, charge[rows, columns], low, high, bound))
 
     def _try_all(self, leaves: Leaves) -> None:
         """Try these patterns, some at once."""
@@ -327,7 +333,9 @@ class _BatchSearch:
                 before, within = problem.best.objective, None
                 positions = leaves.chosen[row][leaves.chosen[row] >= 0]
                 if self._of.sized:
-                    within = leaves.low[row, : len(positions)], leaves.high[row, : len(positions)]
+                    low, high = leaves.low[row, : len(positions)], leaves.high[row, : len(positions)]
+                    sized = self._of.min_size[self._order[positions]] > 0
+                    within = None if (sized & (low < 0) & (high > 0)).any() else (low, high)
                 found = problem.offer(problem.pattern(positions), within)
                 leaves.bound[row] = np.inf
                 leaves = self._priced(leaves, found)
