@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 import mampc
 from mampc import MampcError, StateSpace, plan_test
 from mampc.cli import app
-from mampc.identification.plant_test import first_guess
+from mampc.identification.plant_test import _Guess, first_guess
 
 lags = StateSpace.from_first_order
 COLUMN = {
@@ -55,6 +55,25 @@ def test_models_from_the_planned_test_are_as_certain_as_promised(guess):
     assert np.sqrt(np.mean(np.square(errors))) < 2 * 0.025
     quiet = mampc.excite(plant, plan.u, dt=plan.dt).y
     np.testing.assert_allclose(np.abs(quiet).max(axis=0), plan.swing, rtol=0.2)
+
+
+@pytest.mark.parametrize("wandering", [0.0, 0.001, 0.02, 0.3])
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_what_outputs_that_wander_tell_is_what_generalised_least_squares_finds(wandering, unit):
+    plan = plan_test(
+        gain=2.0 * unit, settling_time=600.0, noise=0.1 * unit, wandering=wandering * unit, max_amplitude=1.0
+    )
+    k = np.arange(len(plan.u))
+    one = np.ones((1, 1))
+    guess = _Guess(one, 150.0 * one, np.zeros((1, 1), dtype=int), one < 0, plan.dt, np.ones(1))
+    moved = plan.u - plan.around
+    columns = [guess.response(moved, 0, 0, *other) for other in ((1.0, 0), (1.0, 1), (1.1, 0))]
+    X = np.column_stack(
+        [columns[0], columns[1] - columns[0], columns[2] - columns[0], k / len(k), np.ones(len(k))]
+    )
+    covariance = 0.1**2 * np.eye(len(k)) + wandering**2 * np.minimum.outer(k, k)
+    deviation = np.sqrt(np.linalg.inv(X.T @ np.linalg.solve(covariance, X))[0, 0])
+    np.testing.assert_allclose(plan.uncertainty[0, 0], 2 * deviation / 2.0, rtol=0.05)
 
 
 @pytest.mark.parametrize("units", [1e-6, 1e4])

@@ -5,7 +5,7 @@ import pytest
 
 import mampc
 from mampc import IOData, MampcError, Noise, StateSpace, n4sid, prbs
-from mampc.identification.drift import white_and_walk
+from mampc.identification.drift import noise_and_walk, white_and_walk
 
 PLANT = StateSpace(
     [[0.9, 0.05], [0.0, 0.8]], [[0.1, 0.05], [0.0, 0.3]], np.eye(2), None, 10.0, [5.0, 6.0], [1.0, 2.0]
@@ -26,6 +26,16 @@ def test_white_noise_and_a_random_walk_are_told_apart(white, walk):
     both = white * rng.standard_normal((20000, 3)) + walk * np.cumsum(rng.standard_normal((20000, 3)), axis=0)
     found = white_and_walk([both[:12000], both[12000:]])
     np.testing.assert_allclose(found, np.tile([[white], [walk]], 3), atol=0.15)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("walk", [0.0, 0.1, 0.3])
+def test_a_walk_is_told_only_where_there_is_one(walk, unit):
+    rng = np.random.default_rng(1)
+    both = rng.standard_normal((1200, 4)) + walk * np.cumsum(rng.standard_normal((1200, 4)), axis=0)
+    white, found = noise_and_walk([unit * both[:700], unit * both[700:]])
+    np.testing.assert_allclose(white / unit, 1.0, rtol=0.1)
+    np.testing.assert_allclose(found / unit, walk, rtol=0.5)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e5])

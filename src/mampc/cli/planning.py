@@ -81,6 +81,8 @@ def plan_test(
         "dt": None if dt is None else number("--dt", dt), "integrating": integrating or None,
         "accuracy": number("--accuracy", accuracy),
     }  # fmt: skip
+    if "dt" in given and dt is not None:
+        given["wandering"] = given["wandering"] * (told["dt"] / given["dt"]) ** 0.5
     given |= {name: value for name, value in told.items() if value is not None}
     missing = [name for name in ("gain", "settling_time", "noise") if name not in given]
     if missing:

@@ -2,7 +2,8 @@
 
 Inputs switch between two levels, as a PRBS, all at once. What the test will tell is reckoned with the information
 matrix of first-order channels with dead times: gain, time constant and dead time of each channel and a line in time of
-each output are unknown, the noise is white. The amplitudes are the least with which gains come out as certain as asked.
+each output are unknown; the noise is white, with a random walk beside it where outputs wander. The amplitudes are the
+least with which gains come out as certain as asked.
 
 Sources: Ljung, System Identification (1999), sections 7.4 and 13.3; Zhu, Multivariable System Identification for
 Process Control (2001), chapter 3, for times between switches and lengths of tests in the process industries.
@@ -31,6 +32,7 @@ from mampc.base.checks import (
 from mampc.base.errors import MampcError, listed
 from mampc.base.files import written_whole
 from mampc.base.names import Names, require_count
+from mampc.identification.drift import whitened, whitening_pole
 from mampc.systems.noise import white_noise
 from mampc.systems.properties import properties, time_in_words
 from mampc.systems.signals import prbs
@@ -92,6 +94,7 @@ def plan_test(
     settling_time: Any,
     noise: Any,
     *,
+    wandering: Any = 0.0,
     dead_time: Any = 0.0,
     integrating: Any = False,
     dt: float | None = None,
@@ -111,6 +114,7 @@ def plan_test(
         settling_time: seconds until an output stays within 2 % of where it goes, the dead time included, scalar or
             (l, m); where it integrates, as long as it may be left alone.
         noise: standard deviation of each output's noise, scalar or (l,).
+        wandering: standard deviation of the steps of each output's random walk in one sample, scalar or (l,).
         dead_time: seconds, scalar or (l, m).
         integrating: which channels integrate, scalar or (l, m).
         dt: sample time in seconds; default about a fortieth of the longest settling time.
@@ -130,7 +134,7 @@ def plan_test(
     settling = _channels("settling_time", settling_time, (l, m))
     dead = _channels("dead_time", dead_time, (l, m))
     integrates = _channels("integrating", _flags(integrating), (l, m)) > 0
-    sigma = as_vector("noise", noise, l)
+    sigma, walk = as_vector("noise", noise, l), as_vector("wandering", wandering, l)
     beyond = max(np.abs(K).max(), sigma.max(initial=0.0))
     if beyond > LARGEST or np.abs(K[K != 0]).min(initial=1.0) < 1 / LARGEST:
         raise MampcError(f"gain, noise: expected sizes of {1 / LARGEST:g} to {LARGEST:g}, received others")
@@ -140,6 +144,7 @@ def plan_test(
         raise MampcError(f"gain: expected each input to move some output, received zeros of input {idle}")
     for name, values, wrong, expected in (
         ("dead_time", dead, dead < 0, "no negative number"),
+        ("wandering", walk, walk < 0, "no negative number"),
         ("settling_time", settling, settling > LARGEST, f"at most {LARGEST:g} s"),
         ("settling_time", settling, settling <= dead, "more than the dead time"),
         ("noise", sigma, sigma <= 0, "more than 0; the least step that is shown, where there is none"),
@@ -163,8 +168,15 @@ def plan_test(
             f"plan_test: expected at most {MOST_SAMPLES} samples, received more; take a longer dt"
         )
     hold = max(1, round(np.sqrt(slowest * fastest) / HOLDS / dt))
+    pole = whitening_pole(sigma, walk)
+    sigma = sigma / np.sqrt(pole)  # of what is left when the noise is made white
     plant = _Guess(
-        K, np.maximum((settling - dead) / SETTLED, dt / 2), np.round(dead / dt).astype(int), integrates, dt
+        K,
+        np.maximum((settling - dead) / SETTLED, dt / 2),
+        np.round(dead / dt).astype(int),
+        integrates,
+        dt,
+        pole,
     )
     rest = int(np.ceil(REST * slowest / dt))
     samples = int(np.ceil(LENGTH * slowest / dt))
@@ -183,7 +195,7 @@ def plan_test(
     swing = np.abs(plant.outputs(amplitude * signal)).max(axis=0)
     return PlannedTest(
         u, dt, middle, amplitude, hold, uncertainty, swing, names,
-        tuple(_notes(names, uncertainty, accuracy, integrates & acts)),
+        tuple(_notes(names, uncertainty, accuracy, integrates & acts, bool(walk.any()))),
     )  # fmt: skip
 
 
@@ -196,7 +208,7 @@ def first_guess(model: StateSpace) -> dict[str, Any]:
     found = properties(model)
     m = model.n_inputs
     noise = white_noise(model.noise)
-    if noise is None:
+    if noise is None or model.noise is None:
         raise MampcError(
             "expected a model with the noise of its outputs, received one without; pass it (--noise)"
         )
@@ -213,20 +225,22 @@ def first_guess(model: StateSpace) -> dict[str, Any]:
     )
     return {
         "gain": gain, "dead_time": dead, "settling_time": np.maximum(settling, dead + model.dt),
-        "integrating": found.integrating[:, :m], "noise": noise, "dt": model.dt, "around": model.u_op,
+        "integrating": found.integrating[:, :m], "noise": noise, "wandering": model.noise.drift,
+        "dt": model.dt, "around": model.u_op,
         "names": model.names.undisturbed(),
     }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class _Guess:
-    """First-order channels: gains, time constants in seconds, dead times in samples, which integrate."""
+    """First-order channels: gains, time constants in seconds, dead times in samples, which integrate; noise."""
 
     gain: Array
     constant: Array
     dead: Any
     integrates: BoolArray
     dt: float
+    pole: Array  # of the filter that makes the noise of each output white; one where it is white
 
     def response(self, u: Array, i: int, j: int, slower: float = 1.0, later: int = 0) -> Array:
         """Of channel (i, j) with a gain of one, shape (N,)."""
@@ -246,14 +260,17 @@ class _Guess:
         N = len(u)
         found = np.full(self.gain.shape, np.nan)
         for i, row in enumerate(self.gain):
-            columns: list[Array] = [np.ones(N), np.arange(N) / N - 0.5]
+            columns: list[Array] = [np.arange(N) / N - 0.5]
             acting = np.flatnonzero(row).tolist()
             for j in acting:
                 nominal = self.response(u, i, j)
                 columns += [nominal, self.response(u, i, j, later=1) - nominal]
                 if not self.integrates[i, j]:
                     columns.append(self.response(u, i, j, slower=1.1) - nominal)
-            X = np.column_stack(columns)
+            start = self.pole[i] ** np.arange(
+                N
+            )  # the filter's unknown state; the output's level where it is one
+            X = np.column_stack([start, whitened(np.column_stack(columns), float(self.pole[i]))])
             size = np.linalg.norm(X, axis=0)
             size[size == 0] = 1.0
             spread = np.sqrt(np.diag(np.linalg.pinv((X / size).T @ (X / size), hermitian=True))) / size
@@ -289,10 +306,12 @@ def _best_signal(plant: _Guess, samples: int, hold: int, rest: int, seed: int) -
     return best[1], best[2]
 
 
-def _notes(names: Names, uncertainty: Array, accuracy: float, integrates: BoolArray) -> list[str]:
+def _notes(
+    names: Names, uncertainty: Array, accuracy: float, integrates: BoolArray, wanders: bool
+) -> list[str]:
     notes = [
         "amplitudes are the least that the noise asks for; larger ones that the plant can bear tell more, and count "
-        "where loads move outputs beside the noise"
+        f"where loads move outputs {'more than in the record' if wanders else 'beside the noise'}"
     ]
     weak = np.argwhere(uncertainty > 1.05 * accuracy)
     if len(weak):
