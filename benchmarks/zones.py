@@ -96,27 +96,27 @@ def outcome(of: Case, name: str, price: float, width: float, pull: float, kalman
 
 
 def moves_at(outcomes: list[Outcome], outside: float) -> float:
-    """Moves of a front at a share of time outside, on straight lines between its points; nan beyond them."""
+    """Moves of a front at a share of time outside, their logarithm being even between its points; nan beyond them."""
     by_time = sorted((o.outside, o.moves) for o in outcomes)
     times, moves = np.array(by_time).T
-    return float(np.interp(outside, times, moves, left=np.nan, right=np.nan))
+    return float(np.exp(np.interp(outside, times, np.log(moves), left=np.nan, right=np.nan)))
 
 
 def draw(fronts: dict[str, list[Outcome]]) -> None:
-    """Both fronts in one figure."""
+    """All fronts in one figure."""
     import matplotlib.pyplot as plt
 
-    from mampc.base.drawing import BLUE, GREEN, VERMILION, styled
+    from mampc.base.drawing import BLUE, GREEN, GREY, VERMILION, styled
 
     with styled():
         figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-        for (name, outcomes), color in zip(fronts.items(), (BLUE, VERMILION, GREEN), strict=True):
+        for (name, outcomes), color in zip(fronts.items(), (GREY, VERMILION, BLUE, GREEN), strict=True):
             axes.errorbar(
                 [100 * o.outside for o in outcomes], [o.moves for o in outcomes],
                 xerr=[100 * o.error for o in outcomes], marker="o", color=color, label=name,
             )  # fmt: skip
         axes.set(xlabel="time outside two sigma, %", ylabel=f"moves in {STEPS} samples", yscale="log")
-        axes.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+        axes.set_yticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
         axes.minorticks_off()
         axes.legend()
         figure.savefig(FIGURE, metadata={"Date": None})
@@ -147,8 +147,8 @@ def main() -> None:
         times()
         return
     kinds = {
-        "set point": (0.0, 0.0), "zone of two sigma": (2.0, 0.0), f"with a pull of {PULL:g}": (2.0, PULL),
-        f"zone of one sigma, pull {PULL:g}": (1.0, PULL),
+        "set point": (0.0, 0.0), "zone of two sigma": (2.0, 0.0), f"two sigma, pull {PULL:g}": (2.0, PULL),
+        f"one sigma, pull {PULL:g}": (1.0, PULL),
     }  # fmt: skip
     of = case(arguments.plant)
     every = [(name, price) for name in kinds for price in PRICES]
