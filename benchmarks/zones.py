@@ -125,13 +125,14 @@ def draw(fronts: dict[str, list[Outcome]]) -> None:
 def times() -> None:
     """Steps with zones against steps with set points, on the samples of the loop with zones."""
     point, rules = tank_problem(), mampc.MoveRules(price=1.0)
-    zone = replace(point, zone_below=2 * SIGMA, zone_above=2 * SIGMA)
-    for name, made in (("MPC", mampc.MPC), ("exact price", lambda problem: mampc.MAMPC(problem, rules))):
-        with_zone, with_point = made(zone), made(point)
-        asked = closed_loop(with_zone)
-        blocks = [(steps_of(with_zone, asked), steps_of(with_point, asked)) for _ in range(3)]
-        found = interleaved(blocks)
-        print(f"{name}: {found} with set points, {found.ratio:.1f} times as long")
+    for pull in (0.0, PULL):
+        zone = replace(point, zone_below=2 * SIGMA, zone_above=2 * SIGMA, zone_pull=pull)
+        for name, made in (("MPC", mampc.MPC), ("exact price", lambda problem: mampc.MAMPC(problem, rules))):
+            with_zone, with_point = made(zone), made(point)
+            asked = closed_loop(with_zone)
+            blocks = [(steps_of(with_zone, asked), steps_of(with_point, asked)) for _ in range(3)]
+            found = interleaved(blocks)
+            print(f"{name}, pull {pull:g}: {found} with set points, {found.ratio:.1f} times as long")
 
 
 def main() -> None:

@@ -187,7 +187,7 @@ def loops(draw):
         output_limit_weight=draw(st.sampled_from([1e2, 1e4])),
         u_target_weight=draw(st.sampled_from([0.0, 0.0, 1e-3, 0.1])), u_cost=draw(input_costs(told, model)),
         zone_below=scale * draw(st.sampled_from([0.0, 0.0, 0.1, np.inf])),
-        zone_above=scale * draw(st.sampled_from([0.0, 0.0, 0.1, 1.0])),
+        zone_above=scale * draw(st.sampled_from([0.0, 0.0, 0.1, 1.0])), zone_pull=draw(st.sampled_from([0.0, 0.1])),
         output_rank=draw(st.sampled_from([None, None, list(range(1, model.n_outputs + 1))])),
     )  # fmt: skip
     rules, method, settings = None, draw(st.sampled_from(["mpc", "alternating", "exact", *SPARSE])), {}

@@ -13,7 +13,7 @@ DOCS = Path(__file__).parents[1] / "docs" / "methods.md"
 STEPS = 8
 ROWS = {
     "zones": {"zone_below": 0.2, "zone_above": 0.3},
-    "a `Zone` told": {"zone_below": 0.2, "zone_above": 0.3},
+    "a `Zone` told": {"zone_below": 0.2, "zone_above": 0.3, "zone_pull": 0.1},
     "ranks": {"output_rank": [1, 2], "limits": mampc.Limits(u_min=0.0, u_max=4.0, y_min=[2.4, 0.0], y_max=[9.0, 1.7])},
     "levels": {},
     "on/off": {},
@@ -164,7 +164,10 @@ CONTROLLER
 """
 WORDS = {
     "zones": {"PROBLEM": "zone_below = 0.2"},
-    "a `Zone` told": {"PROBLEM": "zone_below = 0.2", "REFERENCE": "zones = [{ at = 3, below = 0.1, above = inf }]"},
+    "a `Zone` told": {
+        "PROBLEM": "zone_below = 0.2\nzone_pull = 0.1",
+        "REFERENCE": "zones = [{ at = 3, below = 0.1, above = inf }]",
+    },
     "ranks": {"PROBLEM": "output_rank = [1, 2]"},
     "levels": {"RULES": ", levels = [[0, 1, 2, 2.5, 4], 0.5]"},
     "on/off": {"RULES": ', levels = [{ min_on = "2 s", min_off = 2 }, "any"]'},
