@@ -12,9 +12,10 @@ import numpy as np
 
 from mampc.base.checks import as_number
 from mampc.base.errors import MampcError
-from mampc.identification import Identified, IOData, Validation, n4sid, read_export
+from mampc.identification import Identified, IOData, Validation, n4sid
 from mampc.identification.excitation import left_open, movement_of
 from mampc.identification.export.findings import counted
+from mampc.identification.export.together import read_together
 from mampc.report.figures import validation_figure
 from mampc.report.output import save_figure
 from mampc.systems.evidence import Evidence
@@ -65,12 +66,7 @@ def identify_and_write(
         share: part of the samples to estimate on.
     """
     show("reading the record")
-    records: list[IOData] = []
-    notes: list[str] = []
-    for path in exports:
-        export = read_export(path, **reading)
-        records += like_the_others(path, export.records, records)
-        notes += [f"{path}: {note}" if len(exports) > 1 else note for note in export.notes]
+    records, notes = read_together(exports, **reading)
     require_writable(target)
     estimation, rest = hold_out(long_enough(records, notes), share)
     show("identifying a model")
@@ -109,28 +105,6 @@ def identify_and_write(
     except MampcError as error:
         warnings.append(f"no figure written; {error}")
     return Outcome(identified, validation, tuple(notes), tuple(warnings), tuple(map(len, estimation)))
-
-
-def like_the_others(path: Path, found: Sequence[IOData], others: Sequence[IOData]) -> list[IOData]:
-    """The records of one more export of a plant, with the names and units of the first.
-
-    Raises:
-        MampcError: another sample time, or another unit.
-    """
-    if not others:
-        return list(found)
-    first, own = others[0], found[0]
-    units = dict(first.names.units)
-    for name, unit in dict(own.names.units).items():
-        if units.get(name, unit) != unit:
-            raise MampcError(
-                f"{path}: expected {name} in {units[name]} as before, received {unit}; export all alike"
-            )
-    if abs(own.dt - first.dt) > 1e-6 * first.dt:
-        raise MampcError(
-            f"{path}: expected samples every {first.dt:g} s as before, received {own.dt:g} s; export all alike"
-        )
-    return [replace(record, names=first.names) for record in found]
 
 
 def long_enough(records: Sequence[IOData], notes: list[str]) -> Sequence[IOData]:

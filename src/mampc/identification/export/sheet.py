@@ -111,6 +111,10 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings, encoding: 
         )
     if content.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf")):
         raise MampcError(f"{source}: expected a readable {KIND}, received a compressed one; unpack it first")
+    if content[:100].lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
+        raise MampcError(
+            f"{source}: expected a readable {KIND}, received HTML or XML; save it as .xlsx or CSV"
+        )
     encoding = _encoding(source, content, findings) if encoding is None else _known(encoding)
 
     def parsed(separator: str) -> Rows:
@@ -279,7 +283,11 @@ def _measured(
         findings.doubt(
             f"expected {width} fields in every row, received {len(ragged[0][1])} in {places}; {names_in}"
         )
-    if ragged and separator == "," and all(len(cells) > width for _, cells in ragged):
+    if (
+        ragged
+        and separator == ","
+        and all(len(cells) > width and is_number_like(cells[-1]) for _, cells in ragged)
+    ):
         findings.doubt(
             "commas may both separate fields and mark decimals: save with semicolons between fields"
         )
