@@ -167,7 +167,8 @@ def test_scenarios_of_tuning_count_from_the_zone():
         u_initial=scenarios.u_initial, progress=False,
     )  # fmt: skip
     np.testing.assert_allclose(error, batch.metrics().tracking_error)
-    assert candidates(plain.controller.problem, np.full(2, 0.05))
+    found = candidates(plain.controller.problem, np.full(2, 0.05))  # each without and with a pull
+    assert {one.problem.zone_pull for one in found} == {0.0, 0.1}
 
 
 def test_a_bank_counts_from_the_zone_of_the_variant_that_decides():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from mampc.program.problem import TrackingProblem
 
 MOVE_WEIGHTS = (0.1, 0.3)  # times those of plain MPC
 TAILS = (0.0, 0.25, 1.0)  # times the prediction horizon
+PULLS = (0.0, 0.1)  # to the middle of zones, where plain MPC has none
 CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
 MOST_MOVES = 9  # of all inputs together, within these, which keeps the patterns to a few hundred
 
@@ -62,19 +64,23 @@ def candidates(problem: TrackingProblem, noise: Array, guessed: bool = False) ->
     m, n_p = problem.model.n_inputs, problem.prediction_horizon
     n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
     estimator, found = LoadBank(problem.model, noise=noise, guessed=guessed), []
-    for share in MOVE_WEIGHTS:
-        for tail in TAILS:
-            sparse = replace(
-                problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail * n_p
-            )
-            candidate = Candidate(f"move weight x {share:g}, tail {tail * n_p:g}", sparse, estimator, guessed)
-            for one in (candidate, replace(candidate, guessed=False)):
-                try:
-                    one.regulator(1.0)
-                except MampcError:  # a tail that an unstable model does not have, or too many patterns
-                    continue
-                found.append(one)
-                break
+    pulls = PULLS if problem.zoned.any() and problem.zone_pull == 0 else (problem.zone_pull,)
+    for share, tail, pull in product(MOVE_WEIGHTS, TAILS, pulls):
+        sparse = replace(
+            problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail * n_p,
+            zone_pull=pull,
+        )  # fmt: skip
+        name = f"move weight x {share:g}, tail {tail * n_p:g}" + (
+            f", pull {pull:g}" if len(pulls) > 1 else ""
+        )
+        candidate = Candidate(name, sparse, estimator, guessed)
+        for one in (candidate, replace(candidate, guessed=False)):
+            try:
+                one.regulator(1.0)
+            except MampcError:  # such as a tail that an unstable model does not have, or too many patterns
+                continue
+            found.append(one)
+            break
     if not found:
         raise MampcError("tune: expected a model that a sparse controller can be built for")
     return found
