@@ -144,5 +144,6 @@ def browser():
 
 @pytest.fixture
 def few_figures(monkeypatch):
-    """A run draws the first of its figures, since drawing takes most of its time."""
+    """A run draws the first of its figures, and commands draw PNG alone, since drawing takes most of their time."""
+    monkeypatch.setattr(output, "FIGURE_KINDS", ("png",))
     monkeypatch.setattr(output, "study_figures", lambda result: islice(study_figures(result), 1))

@@ -165,7 +165,7 @@ def gappy(record, tmp_path):
     return tmp_path / "gappy.csv"
 
 
-def test_identify_tells_what_it_noticed_and_takes_every_piece(gappy, tmp_path):
+def test_identify_tells_what_it_noticed_and_takes_every_piece(gappy, tmp_path, few_figures):
     names = ("--inputs", '"valve, left",pump', "--outputs", "level,flow")
     done = call("identify", "gappy.csv", *names, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -176,7 +176,7 @@ def test_identify_tells_what_it_noticed_and_takes_every_piece(gappy, tmp_path):
     np.testing.assert_allclose(np.sort(poles.real), [0.6, 0.8], atol=0.05)
 
 
-def test_identify_takes_several_files(record, gappy, tmp_path):
+def test_identify_takes_several_files(record, gappy, tmp_path, few_figures):
     (tmp_path / "other.csv").write_text(gappy.read_text().replace('"valve, left"', "valve"))
     done = call(
         "identify", record, "other.csv", "--inputs", "valve,pump", "--outputs", "level,flow", "-o", "m.json",
@@ -222,7 +222,7 @@ def test_inspect_tells_what_is_missing_and_what_to_decide(tmp_path):
     assert (tmp_path / "seen.svg").exists()
 
 
-def test_scattered_bad_values_do_not_spoil_a_model(tmp_path):
+def test_scattered_bad_values_do_not_spoil_a_model(tmp_path, few_figures):
     rng = np.random.default_rng(1)
     model = mampc.StateSpace([[0.9]], [[1.0]], [[1.0]], None, dt=10.0)
     u = mampc.prbs(order=9, amplitude=1.0, hold=5)

@@ -45,7 +45,7 @@ def test_a_ramp_does_not_change_the_gain(slope, time_constant, units):
 
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("step", [0.05, 0.2])
-@pytest.mark.parametrize("seed", [0, 2, 3])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_a_random_walk_leaves_the_gain_roughly_right(seed, step, units):
     record = record_with(
         lambda rng, N: step * np.cumsum(rng.standard_normal(N)), seed=seed, samples=2000, noise=0.02, units=units
@@ -112,7 +112,7 @@ def delayed_record(delays, time_constants, seed, *, noise=0.05, samples=2500, un
     return IOData(u * units[0], noisy * units[1], 1.0), IOData(u * units[0], y * units[1], 1.0)
 
 
-@pytest.mark.parametrize("units", UNITS)
+@pytest.mark.parametrize("units", [pytest.param(UNITS[0], marks=pytest.mark.slow), UNITS[1]])
 @pytest.mark.parametrize("noise", [pytest.param(0.02, marks=pytest.mark.slow), 0.1])
 @pytest.mark.parametrize(
     "delays", [[[45]], [[150]], [[45, 45], [44, 46]], [[45, 5], [12, 30]]],

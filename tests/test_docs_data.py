@@ -20,6 +20,11 @@ def commands():
     return [shlex.split(line)[1:] for line in lines if line.startswith("mampc ")]
 
 
+def told():
+    """What the page says that `mampc inspect` tells."""
+    return (DOCS / "data.md").read_text().split("```text")[1].split("```")[0].strip().splitlines()
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS))
@@ -36,6 +41,8 @@ def test_the_commands_lead_from_the_export_to_a_running_study(folder, few_figure
     for command in commands():
         outcome = CliRunner().invoke(app, command)
         assert outcome.exit_code == 0, outcome.output
+        if command == ["inspect", "export.csv"]:
+            assert all(sentence in outcome.output for sentence in told())
     model = mampc.StateSpace.load(folder / "tank.json")
     assert (model.dt, model.n_inputs, model.n_outputs) == (10.0, 2, 2)
     assert dict(model.names.units)["LI-1.PV"] == "cm"
@@ -52,9 +59,3 @@ def test_the_python_of_the_page_runs(folder):
     exec(code, scope)
     assert [len(record) for record in scope["export"].records] == [333, 69, 95, 171, 248, 324]
     assert len(scope["fitted"].fit) == 2
-
-
-def test_what_the_page_says_is_told(folder):
-    outcome = CliRunner().invoke(app, ["inspect", "export.csv"])
-    for sentence in (DOCS / "data.md").read_text().split("```text")[1].split("```")[0].strip().splitlines():
-        assert sentence in outcome.output

@@ -12,7 +12,7 @@ from seeds import examples
 
 pytestmark = pytest.mark.usefixtures("either_estimator")
 
-STEPS = 30
+STEPS = examples(30, quick=24)
 POLISHED = {name: {"polish": True, "warm_up": 0} if name == "alternating" else {} for name in mampc.METHODS}
 SIZES = st.one_of(st.just(0.0), st.floats(0.05, 1.0))
 

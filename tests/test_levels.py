@@ -152,7 +152,9 @@ def test_no_course_of_an_on_off_valve_is_better(timed, seed):
     assert decision.objective == pytest.approx(best, rel=1e-9)
 
 
-@pytest.mark.parametrize("levels", [[0.0, 10.0], [0.0, 4.0, 10.0], list(range(11))], ids=len)
+@pytest.mark.parametrize(
+    "levels", [[0.0, 10.0], [0.0, 4.0, 10.0], list(range(0, 11, examples(1, quick=2)))], ids=len
+)
 @pytest.mark.parametrize("rules", [{}, {"price": 0.1}, {"max_moves": 3}, {"price": 0.1, "dwell": 2}], ids=str)
 def test_scip_finds_nothing_better(levels, rules):
     problem = on_off_problem(8)
@@ -166,7 +168,7 @@ def test_scip_finds_nothing_better(levels, rules):
     assert decision.objective >= lower * (1 - 1e-6)
 
 
-@pytest.mark.parametrize("n", [10, 15])
+@pytest.mark.parametrize("n", [10, pytest.param(15, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("u_max", [10.0, 1e5])
 def test_an_on_off_valve_holds_a_mean_between_its_levels(n, u_max):
     problem = on_off_problem(n, u_max)
@@ -185,7 +187,9 @@ def test_timings_are_kept_in_closed_loop(timing, held):
     problem = replace(problem, model=first_order(dt=1.0))
     rules = mampc.MoveRules(levels=mampc.OnOff(**timing))
     regulator = mampc.Regulator(mampc.MAMPC(problem, rules))
-    run = mampc.simulate(problem.model, regulator, [6.0], steps=150, noise=0.05, u_initial=[0.0])
+    run = mampc.simulate(
+        problem.model, regulator, [6.0], steps=examples(150, quick=75), noise=0.05, u_initial=[0.0]
+    )
     assert keeps_timings(rules, problem, np.zeros((1, 1)), run.u)
     assert moved(run.u).any()
 
@@ -207,7 +211,7 @@ def test_every_method_stays_on_levels_and_is_certified(method, levels):
     certify = {} if method == "exact" else {"certify": True}
     regulator = loop_of(method, levels, settings=METHODS[method] | certify)
     model = regulator.controller.problem.model
-    reference = mampc.steps(examples(12, quick=8), model.y_op, [(3, model.y_op + 1.0)])
+    reference = mampc.steps(examples(12, quick=5), model.y_op, [(3, model.y_op + 1.0)])
     run = mampc.simulate(model, regulator, reference, noise=0.1, u_initial=[0.0, 0.0])
     known = regulator.controller.levels.values
     assert on_levels(run.u, [None if v is None else v.tolist() for v in known])

@@ -167,7 +167,7 @@ def test_a_plant_outside_its_output_limits_is_brought_back_and_the_violation_is_
     problem = tank_problem(model, prediction_horizon=20, limits=limits)
     controller = controller_of(method, problem)
     state, x, told = controller.initial_state(), np.zeros(4), []
-    for _ in range(60):
+    for _ in range(40):
         decision = controller.step(state, x, model.y_op + np.array([-3.0, 0.0]))
         assert not decision.held
         told.append(decision.violations)

@@ -52,7 +52,7 @@ def test_a_noise_free_record_gives_back_system_order_and_transient(seed, size, f
 
 @pytest.mark.parametrize("feedthrough", [False, True])
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3, quick=1))
 def test_a_transient_that_shifts_the_means_disturbs_neither_order_nor_dynamics(seed, size, feedthrough):
     system = random_system(seed, *size, feedthrough)
     fitted = n4sid(noise_free(system, seed, at_rest_on_average=False))
@@ -83,7 +83,7 @@ def test_the_result_describes_the_record():
 
 
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
-@pytest.mark.parametrize("seed", seeds(4, quick=2))
+@pytest.mark.parametrize("seed", seeds(4, quick=1))
 def test_units_decide_nothing(seed, weighting):
     """Every signal in a unit of its own: the same order, poles, fits, hold-out fits and initial state."""
     rng = np.random.default_rng(seed)
@@ -325,7 +325,7 @@ def test_impossible_requests_are_refused(samples, options, message):
 def test_records_are_identified_from_a_least_length_on(m, l, weighting):
     rng = np.random.default_rng(0)
     least = 4 * (m + l + 1) - 1
-    for samples in range(1, least + 20):
+    for samples in (1, least - 1, *range(least, least + 20, examples(1, quick=5))):
         data = IOData(rng.standard_normal((samples, m)), rng.standard_normal((samples, l)), 1.0)
         if samples < least:
             with pytest.raises(MampcError, match=f"expected at least {least} samples"):

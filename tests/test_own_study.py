@@ -117,8 +117,8 @@ def test_what_the_record_said_is_in_it():
 
 
 def test_names_of_any_kind_and_many_signals_make_a_study():
-    names = mampc.Names(tuple(f"u\n{i}\x07" for i in range(30)), tuple(f'"y{i}' for i in range(40)))
-    model = lags(gain=np.eye(40)[:, :30] * np.pi, time_constant=9.0, dt=1.0, names=names)
+    names = mampc.Names(tuple(f"u\n{i}\x07" for i in range(15)), tuple(f'"y{i}' for i in range(20)))
+    model = lags(gain=np.eye(20)[:, :15] * np.pi, time_constant=9.0, dt=1.0, names=names)
     study = parse_study(own_study(model, 'a "b"\\\n.json', "na\nme"))
     assert study.model.file == 'a "b"\\\n.json'
 

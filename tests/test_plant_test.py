@@ -188,7 +188,7 @@ def identified(tmp_path, u, noise=0.05, code=0):
     return " ".join((outcome.output + str(outcome.exception or "")).split())
 
 
-def test_identify_says_what_a_poor_record_leaves_open(tmp_path):
+def test_identify_says_what_a_poor_record_leaves_open(tmp_path, few_figures):
     u = mampc.prbs(order=8, amplitude=1, hold=10, inputs=2, samples=1200)
     assert "plan-test" not in identified(tmp_path, u)
     alike = u[:, [0, 0]] + 0.02 * np.random.default_rng(0).standard_normal((1200, 2))
