@@ -240,3 +240,62 @@ def test_the_proven_optimum_has_the_same_moves_in_units_that_have_no_prefix(rule
         for a, b in zip(usual, decisions_in(u, y, seed, "exact", RULED[rules]), strict=True):
             np.testing.assert_array_equal(b.moves, a.moves)
             assert (b.status, b.remarks) == (a.status, a.remarks)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_units_of_states_do_not_decide(seed):
+    rng = np.random.default_rng(seed)
+    delay = np.eye(3, k=1)
+    A = np.block(
+        [
+            [np.array([[0.9, 0.3], [0.0, 0.7]]), np.outer([0.2, 0.5], [1.0, 0.0, 0.0])],
+            [np.zeros((3, 2)), delay],
+        ]
+    )
+    model = mampc.StateSpace(A, np.eye(5)[:, -1:], np.eye(5)[:1], None, 1.0)
+    unit = 2.0 ** rng.integers(-25, 26, 5)
+    other = mampc.StateSpace(A * unit[:, None] / unit, model.B * unit[:, None], model.C / unit, None, 1.0)
+    np.testing.assert_allclose(other.dc_gain(), model.dc_gain(), rtol=1e-9)
+    runs = []
+    for one in (model, other):
+        problem = mampc.TrackingProblem(
+            one, prediction_horizon=12, control_horizon=3, limits=mampc.Limits(u_min=-2.0, u_max=2.0)
+        )
+        controller = mampc.MAMPC(problem, mampc.MoveRules(price=0.05))
+        kalman = mampc.Regulator(controller, mampc.KalmanFilter.offset_free(one))
+        for regulator in (kalman, mampc.Regulator(controller)):
+            # What does not fit the model, up to what is too far off to be believed.
+            load = np.where(np.arange(40)[:, None] > 15, 1.5, 0.0) + 9.0 * (np.arange(40)[:, None] == 25)
+            runs.append(
+                mampc.simulate(model, regulator, [1.0], steps=40, noise=0.02, seed=1, output_disturbance=load)
+            )
+    for run, same in zip(runs[:2], runs[2:], strict=True):
+        np.testing.assert_allclose(same.u, run.u, rtol=1e-9, atol=1e-9)
+        assert [d.ignored_outputs for d in same.decisions] == [d.ignored_outputs for d in run.decisions]
+    assert any(d.ignored_outputs for d in runs[0].decisions)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steady_states_and_what_a_price_leaves_do_not_depend_on_units(seed):
+    rng = np.random.default_rng(seed)
+    gain = np.array([[1.0, 0.5, -0.2], [0.3, -1.0, 0.8]])
+    model = mampc.StateSpace.from_first_order(gain=gain, time_constant=10.0 + 20 * rng.random((2, 3)), dt=2.0)
+    x, u, y = (2.0 ** rng.integers(-25, 26, count) for count in (model.n_states, 3, 2))
+    other = mampc.StateSpace(
+        model.A * x[:, None] / x, model.B * x[:, None] / u, model.C * y[:, None] / x, None, model.dt
+    )
+    np.testing.assert_allclose(
+        other.steady_state([1, 2, 3] * u) / x, model.steady_state([1, 2, 3]), rtol=1e-9
+    )
+    offsets = [
+        mampc.largest_offset(
+            mampc.TrackingProblem(
+                one, prediction_horizon=20, control_horizon=2, output_weight=1 / wide**2,
+                move_weight=0.1 / far**2, tail_horizon=100.0,
+            ),
+            mampc.MoveRules(price=0.1),
+        ) / wide
+        for one, wide, far in ((model, np.ones(2), np.ones(3)), (other, y, u))
+    ]  # fmt: skip
+    assert np.isfinite(offsets[0]).all()
+    np.testing.assert_allclose(offsets[1], offsets[0], rtol=1e-6)

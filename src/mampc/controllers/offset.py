@@ -18,6 +18,7 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import TrackingProblem
+from mampc.program.tail import square_root
 
 HIGHEST_PRICE = 1 / 16  # of what moves save after a change: changes of a quarter of it are still worth them
 LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
@@ -49,10 +50,13 @@ def largest_offset(problem: TrackingProblem, rules: MoveRules) -> Array:
     stable = np.max(np.abs(np.linalg.eigvals(model.A)), initial=0.0) < 1 - 1e-9
     if not promised or not stable or m < l or problem.prices_inputs or problem.zoned.any():
         return nothing
-    gain = model.dc_gain()[:, :m]
-    if np.linalg.matrix_rank(gain) < l:
+    weighted = square_root(problem.output_weight)
+    gain = weighted @ model.dc_gain()[:, :m]
+    unit = np.linalg.norm(gain, axis=0)
+    unit = np.where(unit > 0, 1 / np.where(unit > 0, unit, 1.0), 0.0)  # so that no input's unit counts
+    if np.linalg.matrix_rank(gain * unit) < l:
         return nothing
-    to_target = np.linalg.pinv(gain)  # moves per unit of offset
+    to_target = unit[:, None] * np.linalg.pinv(gain * unit) @ weighted  # moves per unit of offset
     condensed = CondensedQP(problem)
     residual = condensed.error_of_reference - condensed.weighted_theta[:, :m] @ to_target
     M = residual.T @ residual + to_target.T @ condensed.R[:m, :m] @ to_target

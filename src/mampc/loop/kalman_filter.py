@@ -104,7 +104,6 @@ class KalmanFilter(Estimator):
         unit = input_units(reach, noise)
         directions = directions_of(model, disturbance, reach, noise, unit)
         A, C = _augmented(model, directions)
-        _require_detectable(A, C / noise[:, None], disturbance)
         wander = 0.3 * noise if drift is None else _positive("drift", drift, l)
         moving = unit if input_noise is None else _positive("input_noise", input_noise, m)
         driven = model.B[:, :m] * moving
@@ -114,6 +113,7 @@ class KalmanFilter(Estimator):
         Q[n:, n:] = np.diag(directions.sizes(wander / noise) ** 2)
         R = np.diag(noise**2)
         of_all = np.concatenate([sizes, np.ones(len(A) - n)])
+        _require_detectable(A * of_all / of_all[:, None], C * of_all / noise[:, None], disturbance)
         units = np.outer(of_all, of_all)
         try:
             P = units * predicted_covariance(A * of_all / of_all[:, None], C * of_all, Q / units, R)

@@ -163,12 +163,14 @@ class StateSpace:
         Raises:
             MampcError: the model integrates, so that no finite gain exists.
         """
-        singular = np.eye(self.n_states) * self.is_discrete - self.A
-        if self.n_states and np.linalg.cond(singular) > 1e13:
+        if not self.n_states:
+            return self.D
+        singular, sizes = self._balanced()
+        if np.linalg.cond(singular) > 1e13:
             raise MampcError(
                 "dc_gain: expected a model without integrators, received a pole at zero frequency"
             )
-        gain: Array = self.C @ np.linalg.solve(singular, self.B) + self.D
+        gain: Array = (self.C * sizes) @ np.linalg.solve(singular, self.B / sizes[:, None]) + self.D
         return gain
 
     def step_response(self, n: int) -> Array:
@@ -237,16 +239,25 @@ class StateSpace:
     def steady_state(self, u: Any) -> Array:
         """Deviation state x, shape (n,), at rest under constant inputs u, shape (m,) or (m + d,).
 
-        For an integrating model the least-norm solution; at the operating point always zeros. Measured
-        disturbances left out are those of the operating point.
+        For an integrating model the smallest solution, in units that make the model's numbers alike; at the operating
+        point always zeros. Measured disturbances left out are those of the operating point.
         """
         inputs = as_array("u", u)
         if inputs.shape == self.u_op.shape:
             inputs = np.concatenate([inputs, self.v_op])
         change = as_vector("u", inputs, self.B.shape[1]) - self.all_inputs_op
-        shift = np.eye(self.n_states) * self.is_discrete
-        x: Array = np.linalg.lstsq(shift - self.A, self.B @ change)[0]
+        if not self.n_states or not change.any():
+            return np.zeros(self.n_states)
+        singular, sizes = self._balanced()
+        x: Array = sizes * np.linalg.lstsq(singular, self.B @ change / sizes)[0]
         return x
+
+    def _balanced(self) -> tuple[Array, Array]:
+        """I - A, or -A in continuous time, in units of the states that make its numbers alike; and these, (n,)."""
+        from scipy.linalg import matrix_balance
+
+        A, (sizes, _) = matrix_balance(self.A, permute=False, separate=True)
+        return np.eye(self.n_states) * self.is_discrete - A, sizes
 
     def response(self, u: Any, x0: Any = None) -> Array:
         """Outputs, shape (N, l), to the inputs u, shape (N, m + d), from the state x0 (default: at rest).
