@@ -11,8 +11,13 @@ import pytest
 import mampc
 from builders import cost_of, distance, predicted, random_model, tank_model, tank_problem
 from mampc import Status
+from mampc.methods.exact import zone_search
+from mampc.methods.exact.relaxation import Relaxation
+from mampc.methods.exact.sample_problem import SampleProblem
+from mampc.methods.exact.terms import Squares
+from mampc.methods.exact.zone_search import single_moves
 from mampc.moves.admissible import AdmissiblePatterns
-from mampc.moves.pattern_solver import PatternSolver
+from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.condensing import CondensedQP
 from mampc.study import parse_study, run_study, template
 from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
@@ -103,6 +108,39 @@ def test_the_exact_optimum_is_that_of_brute_force(rules):
         prices = [charge(rules, p) if keeps_rules(rules, past, p) else INF for p in all_patterns(3, 2)]
         costs = best_on_every_pattern(problem, rules, x, past[-1], reference)
         assert decision.objective == pytest.approx(min(costs + prices), rel=1e-6)
+
+
+@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_single_moves_cost_at_least_what_is_said_and_without_limits_just_that(seed, limited):
+    changes = {} if limited else {"limits": mampc.Limits()}
+    problem, x, reference, _ = random_problem(seed, zone_pull=0.1 * (seed % 2), **changes)
+    condensed, sample = sampled(problem, x, reference)
+    admissible, past = AdmissiblePatterns(mampc.MoveRules(price=0.1), 2, 3), problem.model.u_op[None]
+    squares, solver = Squares(condensed, np.arange(6)), PatternSolver(condensed, admissible)
+    relaxation = Relaxation(condensed, squares.order, squares.L[:, :-1])
+    at = SampleProblem(
+        squares, relaxation, admissible, solver, sample, admissible.allowance(past), Incumbent(), np.inf
+    )
+    best = [solver.solve(sample, row).objective for row in np.eye(6, dtype=bool)]
+    said = single_moves(at)
+    assert (said <= np.multiply(best, 1 + 1e-9)).all()
+    if not limited:
+        np.testing.assert_allclose(said, best, rtol=1e-9)
+
+
+def test_single_moves_are_tried_no_longer_than_there_is_time(monkeypatch):
+    problem, x, reference, _ = random_problem(2)
+    near = problem.model.y_op + 0.01 * (reference - problem.model.y_op)
+    tried, offer = [], SampleProblem.offer
+    monkeypatch.setattr(SampleProblem, "offer", lambda *of: tried.append(1) or offer(*of))
+    monkeypatch.setattr(zone_search, "single_moves", lambda at: np.zeros(len(at.order)))
+    monkeypatch.setattr(SampleProblem, "late", property(lambda _: len(tried) > 3))
+    controller = mampc.MAMPC(problem, mampc.MoveRules(price=0.1))
+    decision = controller.step(controller.initial_state(), 0.3 * x, near)
+    assert decision.status is Status.TIME_LIMIT
+    assert decision.lower_bound <= decision.objective
+    assert len(tried) == 4
 
 
 def test_the_exact_optimum_is_that_of_scip():

@@ -1,8 +1,8 @@
-"""The exact search where outputs have zones: patterns have no bound there that needs no program.
+"""The exact search where outputs have zones: patterns of several moves have no bound there that needs no program.
 
 It starts from a local search with set points at the nearest ends of the zones. No plan costs less than that with every
 move free and its prices, so that a good plan leaves few moves that pay: few patterns are tried one by one, more are
-left to branch and bound.
+left to branch and bound. What a single move costs at least is a function of one number, for all moves at once.
 """
 
 from __future__ import annotations
@@ -12,13 +12,16 @@ from math import comb
 
 import numpy as np
 
+from mampc.base.checks import Array
 from mampc.methods.exact.branching import Branching
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.local_search import LocalSearch
 from mampc.moves.pattern_solver import PatternSolver
+from mampc.program.sample import Indices
 
-FEW = 60  # patterns that are tried one by one
+FEW = 60  # patterns of several moves that are tried one by one
 MOST = 3  # moves that these have
+ROUNDS = 8  # of Newton's method for single moves
 
 
 def search_zones(problem: SampleProblem, solver: PatternSolver, local: LocalSearch) -> float:
@@ -35,12 +38,49 @@ def search_zones(problem: SampleProblem, solver: PatternSolver, local: LocalSear
         local.offer(solver, sample, f, problem.allowance, problem.best, problem.deadline)
         if not _are_few(problem, least):
             return Branching(problem).run()
-    for count in range(1, _most_moves(problem, least) + 1):
+    single = single_moves(problem)
+    for i in np.argsort(single):
+        if single[i] >= problem.cutoff:
+            break
+        if problem.late:
+            return least
+        _offer(problem, np.array([i]))
+    for count in range(2, _most_moves(problem, least) + 1):
         for positions in combinations(range(len(problem.order)), count):
-            pattern = problem.pattern(np.array(positions))
-            if problem.admissible.allows(pattern, problem.allowance):
-                problem.offer(pattern)
+            if problem.late:
+                return least
+            _offer(problem, np.array(positions))
     return np.inf
+
+
+def _offer(problem: SampleProblem, positions: Indices) -> None:
+    pattern = problem.pattern(positions)
+    if problem.admissible.allows(pattern, problem.allowance):
+        problem.offer(pattern)
+
+
+def single_moves(problem: SampleProblem) -> Array:
+    """What each move alone costs at least, limits of outputs aside and its price included, shape (n,).
+
+    With L the curvature without zones a function f of a move costs at least f - f'^2 / (4 L) wherever it is taken.
+    """
+    squares, sample, of = problem.squares, problem.sample, problem.admissible
+    zones, rows = squares.condensed.bounds.zones, squares.condensed.bounds.zone_rows
+    assert zones is not None
+    L, c = squares.L[:, :-1], problem.terms.c[:, :1]
+    theta, weight = zones.theta[:, problem.order], zones.root * zones.root
+    low, high = sample.lower[rows, None], sample.upper[rows, None]
+    x = np.zeros(len(problem.order))
+    best = np.full(len(x), -np.inf)
+    for _ in range(ROUNDS):
+        missed, values = L * x - c, theta * x
+        away = values - np.minimum(np.maximum(values, low), high)
+        cost = np.square(missed).sum(axis=0) + weight @ np.square(away)
+        slope = 2 * ((missed * L).sum(axis=0) + weight @ (away * theta))
+        np.maximum(best, cost - slope * slope / (4 * squares.curvature), out=best)
+        x -= slope / (2 * (squares.curvature + weight @ np.where(away != 0, theta * theta, 0.0)))
+    single: Array = best + problem.terms.rest[0] + of.price[problem.order % of.n_inputs]
+    return single
 
 
 def _most_moves(problem: SampleProblem, least: float) -> int:
@@ -59,5 +99,5 @@ def _most_moves(problem: SampleProblem, least: float) -> int:
 def _are_few(problem: SampleProblem, least: float) -> bool:
     """Whether the patterns that may be better are few."""
     most = _most_moves(problem, least)
-    patterns = sum(comb(len(problem.order), count) for count in range(1, min(most, MOST) + 1))
+    patterns = sum(comb(len(problem.order), count) for count in range(2, min(most, MOST) + 1))
     return most <= MOST and patterns <= FEW
