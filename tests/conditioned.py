@@ -60,7 +60,8 @@ def model_of(kind, rng, m):
     return mampc.StateSpace(A, B, C, D, 1.0, u_op, unit * rng.uniform(-5, 5, 1)), unit, pole
 
 
-def case_of(seed):
+def case_of(seed, *, moves_limited=False):
+    """A case of its own for each seed; with or without limits of the moves beside those of the inputs."""
     rng = np.random.default_rng(seed)
     kind = KINDS[seed % len(KINDS)]
     n_c, m = [(5, 1), (4, 1), (3, 2), (2, 2)][rng.integers(4)]
@@ -88,6 +89,9 @@ def case_of(seed):
         limits = {"u_min": u - size * rng.uniform(0, 1, m), "u_max": u + size * rng.uniform(0.3, 1, m)}
     if limited:  # a larger move would never be possible
         options["min_size"] = min(options["min_size"], 0.9 * float((limits["u_max"] - limits["u_min"]).min()))
+    if moves_limited:
+        limits["du_max"] = 10 ** rng.uniform(-1.5, 0.5, m)
+        options["min_size"] = min(options["min_size"], 0.9 * float(limits["du_max"].min()))
     rules = mampc.MoveRules(**{name: options[name] for name in used})
     problem = mampc.TrackingProblem(
         model, prediction_horizon=n_p, control_horizon=n_c, output_weight=weight, move_weight=move_weight,
@@ -229,6 +233,8 @@ class Referee:
                 if np.isfinite(limit):
                     row = dict.fromkeys((k for k in moves if k <= i and k % m == a), sign)
                     bounds.append((row, sign * (number(limit) - u)))
+            if np.isfinite(limits.du_max[a]):
+                bounds += [({i: sign}, number(limits.du_max[a])) for sign in (1.0, -1.0)]
         best = inf
         sized = [i for i in moves if size[i % m] > 0]
         for signs in product((1.0, -1.0), repeat=len(sized)):

@@ -25,9 +25,23 @@ def decided(case, method="exact", **settings):
     return controller.step(controller.initial_state(case.past), case.x, case.reference)
 
 
-@pytest.mark.parametrize("seed", [*seeds(400, quick=30), 1106])
-def test_proven_optima_are_those_of_brute_force_in_120_digits(seed):
-    case = case_of(seed)
+@pytest.mark.parametrize(
+    ("seed", "moves_limited"),
+    [*((seed, False) for seed in (*range(30), 1106, 2425)), *((seed, True) for seed in range(10))],
+)
+def test_proven_optima_are_those_of_brute_force_in_120_digits(seed, moves_limited):
+    holds(case_of(seed, moves_limited=moves_limited))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moves_limited", [False, True])
+@pytest.mark.parametrize("seed", range(30, 400))
+def test_more_proven_optima_are_those_of_brute_force_in_120_digits(seed, moves_limited):
+    holds(case_of(seed, moves_limited=moves_limited))
+
+
+def holds(case):
+    """What a decision promises about objective and bound, against the referee."""
     try:
         decision, referee = decided(case), Referee(case)
     except mampc.MampcError as error:  # said when the problem is made

@@ -31,6 +31,7 @@ from mampc.base.errors import MampcError, MampcWarning
 from mampc.base.tolerances import prefix
 from mampc.program.bounds import Bounds
 from mampc.program.input_cost import distance_from_targets, price_of_inputs
+from mampc.program.least_distance import ROUNDING
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
@@ -39,7 +40,6 @@ from mampc.program.restriction import Restriction
 from mampc.program.sample import Indices, LeastSquares, Parts, PatternOptimum, Sample
 from mampc.program.tail import square_root, tail
 
-ROUNDING = 1e-15  # of what a sum adds up: how far it may be from the truth
 ILL_CONDITIONED = 3e6  # condition, or growth of predictions, from which on a proof has to look at rounding
 SINGULAR = 1e13  # condition of U, of unit columns, from which on rounding determines some move
 

@@ -24,6 +24,7 @@ from mampc.program.refinement import refined
 SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
 UNCERTAIN = 1e-10  # of the excess: what a solver's slack may be worth before the solution is refined
 VIOLATED = 1e-18  # in the solver's units: a violation up to here is rounding
+ROUNDING = 1e-15  # of what a sum adds up: how far it may be from the truth
 DOUBTFUL = 1e4  # condition of R from which on the slack that a solver leaves is looked at
 
 
@@ -223,8 +224,10 @@ class LeastDistance:
         pull, v, (low, high) = multipliers / self.even, self._v, distances
         gradient = pull.dot(self._every)
         gradient += self._f
-        excess = -0.25 * gradient.dot(gradient) - pull.dot(np.where(pull > 0, high, low))
-        return -0.5 * gradient[v:], float(excess)
+        square, kept = 0.25 * float(gradient.dot(gradient)), float(pull.dot(np.where(pull > 0, high, low)))
+        # Where moves are nearly the same, squares far above the cost cancel each other: no bound may gain by that.
+        lost = len(gradient) * ROUNDING * (square + abs(kept))
+        return -0.5 * gradient[v:], -square - kept - lost
 
     def distances(self, optimum: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
         """The bounds as distances from the optimum."""

@@ -20,7 +20,8 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
-from mampc.program.condensing import ROUNDING, CondensedQP
+from mampc.program.condensing import CondensedQP
+from mampc.program.least_distance import ROUNDING
 from mampc.program.restriction import by_count, excess_table
 from mampc.program.sample import Indices, LaterData, LeastSquares, Optimum, PatternOptimum, Sample
 
