@@ -7,7 +7,6 @@ from typer.testing import CliRunner
 import mampc
 from builders import random_model
 from mampc.cli import app
-from mampc.report.output import run_and_write
 from mampc.study import parse_study, run_study
 
 STEPS = 24
@@ -134,16 +133,16 @@ rules = { price = 0.05 }
 """
 
 
-def test_a_study_says_what_operators_do_and_its_trajectory_replays(tmp_path, few_figures):
+def test_a_study_says_what_operators_do_and_its_trajectory_replays(tmp_path):
     random_model(3).save(tmp_path / "model.json")
     (tmp_path / "study.toml").write_text(STUDY)
-    result, *_ = run_and_write(parse_study(STUDY, folder=tmp_path), tmp_path / "out")
-    run = result.runs["a shift"]["price"]
+    run = run_study(parse_study(STUDY, folder=tmp_path)).runs["a shift"]["price"]
+    run.to_csv(tmp_path / "a-shift_price.csv")
     assert (run.u[4:10] <= 0.5 + 1e-12).all()
     assert (run.position[6:9, 0] == 0.25).all()
     asked = [
         "replay",
-        str(tmp_path / "out" / "a-shift_price.csv"),
+        str(tmp_path / "a-shift_price.csv"),
         "-s",
         str(tmp_path / "study.toml"),
         "--tolerance",
