@@ -378,3 +378,10 @@ def test_noise_is_told_from_what_a_linear_model_lacks_of_a_nonlinear_plant():
     record = mampc.excite(plant, u, dt=10.0, noise=0.1, seed=1)
     found = mampc.n4sid(record, order=4, feedthrough=False).model.noise.output
     np.testing.assert_allclose(found, 0.1, rtol=0.2)
+
+
+@pytest.mark.parametrize("order", [3, 4, 6])
+def test_a_model_has_the_order_asked_for_though_the_disturbance_has_a_colour(order):
+    u = mampc.prbs(order=8, amplitude=25.0, hold=5, mean=[50.0, 50.0])
+    data = mampc.excite(mampc.plants.QuadrupleTank(), u, dt=10.0, noise=0.1, seed=1)
+    assert mampc.n4sid(data, order=order, feedthrough=False).model.n_states == order

@@ -109,7 +109,8 @@ def chosen(
     trends = ("constant", "linear", "differences") if detrend == "auto" else (detrend,)
     choices = [Choice(trend, found) for trend in trends]
     scores = [scored(choice) for choice in choices]
-    if detrend == "auto" and (feedback or scores[0].walk > WALK):
+    # White disturbances come with orders of their own, where none is asked for.
+    if detrend == "auto" and (feedback or (settings.order is None and scores[0].walk > WALK)):
         trends = (*trends, "whitened")
         choices.append(Choice("whitened", found))
         scores.append(scored(choices[-1]))
