@@ -376,3 +376,14 @@ def test_plain_mpc_of_an_unstable_model_looks_no_further_than_its_errors_grow_te
     assert problem.prediction_horizon == 59  # 1.04**59 > 10
     assert scenario_length(problem) <= 295
     assert np.abs(CondensedQP(problem).closed_loop_poles()).max() < 0.99
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_search(tmp_path, monkeypatch):
+    monkeypatch.setattr(tuning, "tune", lambda *_, **__: pytest.fail("searched"))
+    mampc.StateSpace.from_first_order(gain=[[2.0]], time_constant=50.0, dt=10.0).save(tmp_path / "model.json")
+    (tmp_path / "taken").write_text("a file")
+    result = command(
+        str(tmp_path / "model.json"), "--u-min", "0", "--u-max", "1", "--out", str(tmp_path / "taken")
+    )
+    assert result.exit_code != 0
+    assert "--out: expected a folder that can be written" in str(result.exception) + result.output

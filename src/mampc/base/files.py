@@ -46,6 +46,8 @@ def made_folder(path: Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise MampcError(f"--out: expected a folder that can be written, received: {error}") from None
+    if not os.access(path, os.W_OK):
+        raise MampcError(f"--out: expected a folder that can be written, received {path}")
     return path
 
 

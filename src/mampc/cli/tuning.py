@@ -50,6 +50,7 @@ def tune(
 
         mampc tune model.json --u-min 0 --u-max 100,80
     """
+    from mampc.base.files import made_folder
     from mampc.compare.tuned_study import study_of_model, told_by, with_tuning
     from mampc.compare.tuning import tune as search
     from mampc.report.tuning import STUDY_FILE, told, tuning_table, write_tuning
@@ -87,6 +88,7 @@ def tune(
         with progress() as show:
             prepared = prepare(study, show)
         model, given = prepared.model, told_by(study, prepared)
+    made_folder(folder)  # what cannot be written is said before the work
     with bar(source) as tell:
         tuned = search(model, **goal, **given, seed=seed, jobs=jobs, progress=False, on_task=tell)
     base = study_of_model(model, tuned, Path(source).stem[:80]) if study is None else study
