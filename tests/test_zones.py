@@ -137,7 +137,7 @@ def test_single_moves_are_tried_no_longer_than_there_is_time(monkeypatch):
     monkeypatch.setattr(zone_search, "single_moves", lambda at: np.zeros(len(at.order)))
     monkeypatch.setattr(SampleProblem, "late", property(lambda _: len(tried) > 3))
     controller = mampc.MAMPC(problem, mampc.MoveRules(price=0.1))
-    decision = controller.step(controller.initial_state(), 0.3 * x, near)
+    decision = controller.step(controller.initial_state(), x, near)
     assert decision.status is Status.TIME_LIMIT
     assert decision.lower_bound <= decision.objective
     assert len(tried) == 4

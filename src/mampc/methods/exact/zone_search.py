@@ -38,6 +38,8 @@ def search_zones(problem: SampleProblem, solver: PatternSolver, local: LocalSear
         local.offer(solver, sample, f, problem.allowance, problem.best, problem.deadline)
         if not _are_few(problem, least):
             return Branching(problem).run()
+    if _most_moves(problem, least) < 1:
+        return np.inf
     single = single_moves(problem)
     for i in np.argsort(single):
         if single[i] >= problem.cutoff:
@@ -71,15 +73,17 @@ def single_moves(problem: SampleProblem) -> Array:
     theta, weight = zones.theta[:, problem.order], zones.root * zones.root
     low, high = sample.lower[rows, None], sample.upper[rows, None]
     x = np.zeros(len(problem.order))
-    best = np.full(len(x), -np.inf)
+    others = problem.terms.rest[0] + of.price[problem.order % of.n_inputs]
+    single: Array = np.full(len(x), -np.inf)
     for _ in range(ROUNDS):
         missed, values = L * x - c, theta * x
         away = values - np.minimum(np.maximum(values, low), high)
         cost = np.square(missed).sum(axis=0) + weight @ np.square(away)
         slope = 2 * ((missed * L).sum(axis=0) + weight @ (away * theta))
-        np.maximum(best, cost - slope * slope / (4 * squares.curvature), out=best)
+        single = np.maximum(single, others + cost - slope * slope / (4 * squares.curvature))
+        if (single >= problem.cutoff).all():
+            break
         x -= slope / (2 * (squares.curvature + weight @ np.where(away != 0, theta * theta, 0.0)))
-    single: Array = best + problem.terms.rest[0] + of.price[problem.order % of.n_inputs]
     return single
 
 
