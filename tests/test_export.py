@@ -145,6 +145,8 @@ def test_a_column_without_numbers_is_refused(tmp_path):
         (("time", "u", "Status", "y", "Status.1"), "OK", ""),
         (("time", "u", "u quality", "y", "y quality"), "", "Questionable"),
         (("time", "u", "q", "y", "q"), "Good", "Bad"),
+        (("time", "u", "u_Güte", "y", "y_Güte"), "gut", "schlecht"),
+        (("time", "u", "u.flag", "y", "y.flag"), "", "*"),
         (("time", "u", "remark", "y", "remark"), "Good", "Bad [No Data]"),
         (("time", "u", "u.Good", "y", "y.Good"), "True", "False"),
         (("time", "u", "Bad_u", "y", "Bad_y"), "0", "1"),
@@ -163,6 +165,20 @@ def test_a_quality_that_stands_before_its_value_speaks_of_that(tmp_path):
     export = read(tmp_path, text(lines, header=("time", "Quality", "u", "Quality", "y")))
     assert told(export, "y: no number in 1 of 12 rows: quality 'bad'")
     assert not told(export, "u: no number")
+
+
+def test_remarks_that_begin_late_are_seen(tmp_path):
+    lines = [
+        [time, "5" if k % 9 else "6", str(0.5 * k), "Bad" if k == 90 else ""]
+        for k, time in enumerate(stamps(120))
+    ]
+    export = read(tmp_path, text(lines, header=("time", "u", "y", "remark")))
+    assert [len(record) for record in export.records] == [90, 29]
+
+
+def test_the_measured_quality_of_a_product_says_nothing_of_others(tmp_path):
+    lines = [[time, u, y, f"9{k % 3}.5"] for k, (time, u, y) in enumerate(rows())]
+    assert_whole(read(tmp_path, text(lines, header=("time", "u", "y", "Quality"))))
 
 
 def test_value_and_quality_of_one_item_belong_together(tmp_path):

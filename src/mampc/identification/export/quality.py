@@ -12,16 +12,16 @@ from mampc.base.checks import BoolArray
 from mampc.base.errors import shown
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import UNIT
-from mampc.identification.export.numbers import Column, says_numbers
+from mampc.identification.export.numbers import Column, is_number, says_numbers
 from mampc.identification.export.sheet import Cells, Sheet
 
 WORDS = (
     "quality", "qual", "opcquality", "status", "statuscode", "qualitycode", "validity", "confidence",
-    "qualität", "qualitaet", "qualité", "calidad",
+    "qualität", "qualitaet", "güte", "qualité", "calidad", "flag", "flags",
 )  # fmt: skip
 TRUTHS = ("good", "isgood", "valid", "isvalid")  # alone only where true or false stands under them
 DENIALS = ("bad", "isbad", "questionable", "substituted")  # what is true under them is not good
-BEHIND_A_NAME = (*WORDS, *TRUTHS, *DENIALS, "q", "qc", "st", "state", "flag", "conf")
+BEHIND_A_NAME = (*WORDS, *TRUTHS, *DENIALS, "q", "qc", "st", "state", "conf")
 DENIAL = re.compile(rf"^({'|'.join(DENIALS)})([\W_]|$)|[\W_]({'|'.join(DENIALS)})[\W_\d]*$")
 VALUE = re.compile(r"[\W_]+(value|val|wert|valeur|valor)$")
 TRUE_OR_FALSE = frozenset({"true", "false", "0", "1", "yes", "no", ""})
@@ -30,7 +30,10 @@ GOOD = frozenset({"good", "g", "ok", "valid", "normal", "raw", "gut", "bon", "tr
 STILL_GOOD = re.compile(
     r"(\d+ )?(good|gut|bon|ok)\b(?!.*\b(not|bad|questionable|uncertain|suspect|stale|substituted)\b).*"
 )
-SPOKEN = re.compile(r"(good|bad|uncertain|questionable)\b.*")  # cells that nothing but a quality holds
+SPOKEN = re.compile(
+    r"(good|bad|uncertain|questionable|gut|schlecht|bon|mauvais)\b.*"
+)  # cells that nothing but a quality holds
+CODE = re.compile(r"\d+(\.0+)?")
 OPC_GOOD = range(192, 256)  # the quality byte of OPC DA: its two highest bits are set
 OPC_BAD = range(64)  # none of them is
 
@@ -43,14 +46,15 @@ def quality_columns(sheet: Sheet, columns: Mapping[str, int]) -> dict[int, tuple
     where the first one has no values there, the one on its right.
     """
     header, taken = sheet.header, set(columns.values())
-    free = [at for at in range(len(header)) if at not in taken]
+    free = [at for at in range(len(header)) if at not in taken and not _measures(sheet, at)]
+    late = _spoken_later(sheet, free)
     found: dict[int, tuple[str, ...]] = {}
     general: dict[str, list[int]] = {}
     for at in free:
         names = tuple(name for name, place in columns.items() if _speaks_of(header[at], header[place]))
         if names:
             found[at] = names
-        elif _is_general(sheet, at) and not _speaks_of_any(header, at):
+        elif (at in late or _is_general(sheet, at)) and not _speaks_of_any(header, at):
             general.setdefault(_plain(header[at]), []).append(at)
     at_position = {position: name for name, position in columns.items()}
     for places in general.values():
@@ -65,7 +69,22 @@ def quality_columns(sheet: Sheet, columns: Mapping[str, int]) -> dict[int, tuple
 
 def is_quality(sheet: Sheet, at: int) -> bool:
     """Whether a column speaks of others, by its name or its first cells."""
-    return _is_general(sheet, at) or _speaks_of_any(sheet.header, at)
+    return not _measures(sheet, at) and (_is_general(sheet, at) or _speaks_of_any(sheet.header, at))
+
+
+def _measures(sheet: Sheet, at: int) -> bool:
+    """Whether numbers with fractions stand there, such as the quality of a product."""
+    return any(is_number(cell) and not CODE.fullmatch(cell) for cell in (row[at] for row in sheet.sample))
+
+
+def _spoken_later(sheet: Sheet, free: Sequence[int]) -> set[int]:
+    """Those of some columns that are empty at first and hold nothing but remarks on quality."""
+    empty = [at for at in free if not any(row[at] for row in sheet.sample)]
+    words: dict[int, set[str]] = {at: set() for at in empty}
+    for part in sheet.chunks(empty) if empty else ():
+        for at, cells in zip(empty, part, strict=True):
+            words[at].update(cell.casefold() for cell in cells if cell) if isinstance(cells, list) else None
+    return {at for at in empty if words[at] and all(map(SPOKEN.fullmatch, words[at]))}
 
 
 def _is_general(sheet: Sheet, at: int) -> bool:
@@ -138,7 +157,7 @@ def drop_bad_quality(
 def _good(words: Sequence[str], named: Collection[str]) -> BoolArray | None:
     """Which words mean a good value; None if that cannot be told."""
     kinds = set(words)
-    numbers = {word: int(float(word)) for word in kinds if re.fullmatch(r"\d+(\.0+)?", word)}
+    numbers = {word: int(float(word)) for word in kinds if CODE.fullmatch(word)}
     named = {word for word in named if word in kinds}
     of_opc = {word for word, number in numbers.items() if number in OPC_GOOD}
     if of_opc:  # a number named for another column is no good byte of this one
