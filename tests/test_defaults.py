@@ -100,3 +100,42 @@ def test_a_delay_that_the_model_lacks_is_forgiven(price, bank):
     run = mampc.simulate(plant, regulator, reference, noise=0.02, seed=1, progress=False)
     assert not np.diff(run.u[200:], axis=0).any()
     assert np.abs(run.y[200:] - 1.0).max() < (0.1 if price < 1 else 0.15)  # what the price leaves
+
+
+@pytest.mark.parametrize("delay", [6.0, 10.0])
+def test_with_longer_delays_missing_the_bank_does_better_than_the_filter(delay):
+    """Of 0.3 and 0.5 of the time constant; cost: squared errors, and a tenth for each move."""
+    model, plant = (
+        mampc.StateSpace.from_first_order(gain=[[2.0]], time_constant=[[20.0]], dead_time=[[late]], dt=1.0)
+        for late in (0.0, delay)
+    )
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=30, control_horizon=3, move_weight=0.1, tail_horizon=30.0,
+        limits=mampc.Limits(u_min=-10.0, u_max=10.0),
+    )  # fmt: skip
+    cost = []
+    for estimator in (LoadBank(model, noise=0.02), KalmanFilter.offset_free(model, measurement_noise=0.02)):
+        regulator = mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator)
+        run = mampc.simulate(
+            plant, regulator, mampc.steps(200, [0.0], [(5, [1.0])]), noise=0.02, seed=1, progress=False
+        )
+        moves = np.count_nonzero(np.diff(run.u, axis=0))
+        cost.append(((run.y - run.r) ** 2).sum() + 0.1 * moves)
+    assert cost[0] < 0.5 * cost[1]
+
+
+def test_on_a_double_integrator_that_the_model_knows_the_bank_does_better_than_the_filter():
+    """Under jumping loads its output goes far; what goes on by itself is no reason to correct less."""
+    model = mampc.StateSpace([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]], None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=20, control_horizon=3, move_weight=0.1,
+        limits=mampc.Limits(u_min=-5.0, u_max=5.0),
+    )  # fmt: skip
+    error = []
+    for estimator in (LoadBank(model, noise=0.05), KalmanFilter.offset_free(model, measurement_noise=0.05)):
+        batch = mampc.simulate_batch(
+            model, mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator), np.zeros((150, 1)),
+            noise=0.05, seeds=range(2), loads=[mampc.loads.RandomSteps(size=0.2, every=40.0)], progress=False,
+        )  # fmt: skip
+        error.append(np.square(batch.y).mean())
+    assert error[0] < error[1]

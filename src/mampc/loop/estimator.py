@@ -83,16 +83,9 @@ class Estimator(ABC):
 
     @abstractmethod
     def corrected(
-        self,
-        predicted: Estimate,
-        innovation: Array,
-        believed: BoolArray | None = None,
-        movement: Array | None = None,
+        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
     ) -> Estimate:
-        """Correct with the innovation (l,), of which only the outputs `believed` count (default all).
-
-        The model moved the outputs by `movement` (l,) since the last sample, default not at all.
-        """
+        """Correct with the innovation (l,), of which only the outputs `believed` count (default all)."""
 
     @abstractmethod
     def loads_of(self, estimate: Estimate) -> Array:

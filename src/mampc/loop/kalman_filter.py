@@ -214,16 +214,9 @@ class KalmanFilter(Estimator):
         return innovation
 
     def corrected(
-        self,
-        predicted: Estimate,
-        innovation: Array,
-        believed: BoolArray | None = None,
-        movement: Array | None = None,
+        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
     ) -> Estimate:
-        """Correct with the innovation (l,), of which only the outputs `believed` count (default all).
-
-        The model moved the outputs by `movement` (l,) since the last sample, default not at all.
-        """
+        """Correct with the innovation (l,), of which only the outputs `believed` count (default all)."""
         gain = self.gain
         if believed is not None:
             gain, innovation = self.gain_with(believed), np.where(believed, innovation, 0.0)

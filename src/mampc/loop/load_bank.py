@@ -9,10 +9,11 @@ mixture of all that may have led to them:
 with the innovation e_b of filter b and its covariance S_b. These hold up to one factor, which the innovations of late
 tell: loads are told in units of the noise, so noise that was told wrongly changes no gain.
 
-While the model moves the outputs, by v in a sample, it may be wrong by a share rho of that: the innovation varies by
-1 + rho^2 v' S_b^-1 v / l times as much then, and what is corrected falls by as much. So what a plant does later or
-less than its model, after a move, is not taken for a load. The factor of the noise counts up to one here: errors of the
-model, which make it larger, are no reason for less caution.
+A plant may do what inputs ask for later, or less of it, than its model says. While outputs lag behind what the inputs'
+moves of the last samples did, h, their innovations vary by 1 + h' diag(S_b^-1) h / l times as much, h of the outputs
+that lag alone, and what is corrected falls by as much. Two standard deviations are forgiven at most: what no delay
+explains is corrected in full; loads, and what goes on by itself, are followed at once. The factor of the noise counts
+up to one here: errors of the model, which make it larger, are no reason for less caution.
 
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
@@ -28,8 +29,8 @@ from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
 from mampc.loop.estimator import Estimate, Estimator, Updated
-from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
-from mampc.loop.mixing import BankEstimate, Filters, Mixing
+from mampc.loop.hypotheses import HYPOTHESES, RUNS_AWAY, Hypothesis, Loads, Member
+from mampc.loop.mixing import IMPOSSIBLE, BankEstimate, Filters, Mixing
 from mampc.program.problem import TrackingProblem
 from mampc.systems.noise import white_noise
 from mampc.systems.state_space import StateSpace, as_discrete
@@ -37,7 +38,8 @@ from mampc.systems.state_space import StateSpace, as_discrete
 NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
-WRONG = 0.5  # rho: the share of its movement of outputs within a sample by which the model may be wrong
+LATE = 5.0  # samples since when a plant may lag behind its model, of those that count less and less
+FORGIVEN = 2.0  # standard deviations of that
 SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
@@ -93,7 +95,7 @@ class LoadBank(Estimator):
         self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
         self._planning_model = self.loads.with_fading(self._kept) if self._kept else model
         self._mixing = Mixing(np.array([h.load is LoadKind.JUMPS for h in self.hypotheses]))
-        self._per_output, self._rest = np.ones(model.n_outputs), np.zeros(model.n_outputs)
+        self._per_output = np.ones(model.n_outputs)
         self._A = np.stack([member.A for member in self.members])
         self._C = np.stack([member.C for member in self.members])
         self._plans = np.stack([self.to_plan(b) for b in range(len(self.members))])
@@ -103,6 +105,7 @@ class LoadBank(Estimator):
         self._filters: dict[bytes, Filters] = {}
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
+        self._of_late, self._lagging = self._moves(), slice(model.n_states, model.n_states + l)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         self._of_states, self._of_known = self._everyday()
         size = self._of_known.shape[0] * self._of_states.shape[0] * self._of_states.shape[2]
@@ -178,7 +181,7 @@ class LoadBank(Estimator):
         members = bank.members.copy()
         members[:, n : n + self.loads.count] = loads[int(stuck.argmax())]
         members[:, n + self.loads.count :] = 0.0
-        return self._estimate(members, bank.weights, bank.usual, bank.scale)
+        return self._estimate(members, bank.weights, bank.usual, bank.scale, bank.late)
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
         """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
@@ -202,7 +205,9 @@ class LoadBank(Estimator):
             x = sizes[:, 0] * np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
         usual = self._mixing.lasts / self._mixing.lasts.sum()
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
-        return self._estimate(members, usual @ self._mixing.chances, usual, np.array([1.0, self._told]))
+        late = np.concatenate([np.zeros(len(self._of_late) - len(u)), u])
+        scale = np.array([1.0, self._told])
+        return self._estimate(members, usual @ self._mixing.chances, usual, scale, late)
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
@@ -220,7 +225,8 @@ class LoadBank(Estimator):
             return None
         each = each.reshape(len(c), -1)
         seen = c.dot(each[:, 2 * n_z : -l])  # innovation and movement of the mixture
-        estimate = self._weighed(*self._split(each), seen[l:], c, bank, self._everything)
+        late = self._of_late.dot(np.concatenate((bank.late, u)))
+        estimate = self._weighed(*self._split(each), seen[:l], late, c, bank, self._everything)
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
@@ -233,7 +239,8 @@ class LoadBank(Estimator):
             each = np.matmul(self._of_states, mixed[..., None])[..., 0]
             each += (known @ self._of_known.T).reshape(len(y), hypotheses, -1)
             seen = np.einsum("sb,sbi->si", c, each[:, :, 2 * n_z : -l])
-            estimate = self._weighed(*self._split(each), seen[:, l:], c, bank, self._everything)
+            late = np.concatenate((bank.late, u), axis=1) @ self._of_late.T
+            estimate = self._weighed(*self._split(each), seen[:, :l], late, c, bank, self._everything)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
     def _split(self, each: Array) -> tuple[Array, Array, Array]:
@@ -269,7 +276,8 @@ class LoadBank(Estimator):
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
         members = np.matmul(self._A, mixed[:, :, None])[:, :, 0]
         members[:, : model.n_states] += model.B @ self._change(u, v)
-        return self._estimate(members, c, bank.usual, bank.scale)
+        late = self._of_late.dot(np.concatenate((bank.late, u)))
+        return self._estimate(members, c, bank.usual, bank.scale, late)
 
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
         """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
@@ -279,23 +287,18 @@ class LoadBank(Estimator):
         return innovation
 
     def corrected(
-        self,
-        predicted: Estimate,
-        innovation: Array,
-        believed: BoolArray | None = None,
-        movement: Array | None = None,
+        self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
     ) -> BankEstimate:
-        """Correct with the innovation (l,) of the mixture, of which only the outputs `believed` count.
-
-        The model moved the outputs by `movement` (l,) since the last sample, default not at all.
-        """
+        """Correct with the innovation (l,) of the mixture, of which only the outputs `believed` count."""
         bank, believed = _bank(predicted), self._all if believed is None else believed
         seen, filters = self._seen(bank.members), self.filters(believed)
-        each = np.where(believed, innovation, 0.0) + bank.weights @ seen - seen
+        innovation = np.where(believed, innovation, 0.0)
+        each = innovation + bank.weights @ seen - seen
         correction = np.matmul(filters.gains, each[:, :, None])[:, :, 0]
         white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
-        moved = self._rest if movement is None else movement
-        return self._weighed(bank.members, correction, white, moved, bank.weights, bank, filters)
+        return self._weighed(
+            bank.members, correction, white, innovation, bank.late, bank.weights, bank, filters
+        )
 
     def filters(self, believed: BoolArray) -> Filters:
         """The gains where only some outputs, bool (l,), are believed."""
@@ -309,7 +312,9 @@ class LoadBank(Estimator):
                 whiten[b][np.ix_(believed, believed)] = np.linalg.inv(root)
                 log_scale[b] = -np.log(np.diag(root) / self.noise[believed]).sum()
             gains = np.stack([member.gain(believed) for member in self.members])
-            filters = self._filters[key] = Filters(gains, whiten, log_scale, int(believed.sum()))
+            filters = self._filters[key] = Filters(
+                gains, whiten, np.square(whiten).sum(axis=1), log_scale, int(believed.sum())
+            )
         return filters
 
     def _weighed(
@@ -317,33 +322,56 @@ class LoadBank(Estimator):
         members: Array,
         correction: Array,
         white: Array,
-        movement: Array,
+        seen: Array,
+        late: Array,
         c: Array,
         bank: BankEstimate,
         filters: Filters,
     ) -> BankEstimate:
-        """The estimate after Bayes' rule, from innovations made white, shape (..., B, l), and movements (..., l)."""
-        share = WRONG**2 / max(filters.believed, 1)
-        if movement.ndim == 1:
-            moved = filters.whiten.dot(movement)
-            moved *= share / min(float(bank.scale[0]), 1.0) * moved
-        else:
-            moved = np.square(filters.whiten @ movement[:, None, :, None])[..., 0]
-            moved *= share / np.minimum(bank.scale[:, :1, None], 1.0)
-        trust = 1 / (1 + moved.dot(self._per_output))
-        surprise = trust * np.square(white).dot(self._per_output)
+        """The estimate after Bayes' rule.
+
+        Args:
+            members, correction: predicted, and what innovations alone would add to them, shape (..., B, n + 2k).
+            white: innovations made white, shape (..., B, l).
+            seen: innovation of the mixture, shape (..., l).
+            late: of the estimate, as predicted.
+            c: how likely each hypothesis was before, shape (..., B).
+        """
+        believed, h = max(filters.believed, 1), late[..., self._lagging]
+        lag = h * (h * seen < 0)
+        surprise = np.square(white).dot(self._per_output)
+        moved = filters.precisions.dot(lag * lag) if lag.ndim == 1 else (lag * lag) @ filters.precisions.T
+        forgiven = FORGIVEN * np.sqrt(moved / np.maximum(surprise, IMPOSSIBLE))
+        trust = np.maximum(1 / (1 + moved / (believed * np.minimum(bank.scale[..., :1], 1.0))), 1 - forgiven)
+        surprise *= trust
         log_scale = filters.log_scale + 0.5 * filters.believed * np.log(trust)
-        after = self._mixing.one if surprise.ndim == 1 else self._mixing.many
+        after = self._mixing.one if seen.ndim == 1 else self._mixing.many
         return self._estimate(
             members + trust[..., None] * correction,
             *after(c, surprise, log_scale, filters.believed, bank.usual, bank.scale),
+            late,
         )
 
-    def _estimate(self, members: Array, weights: Array, usual: Array, scale: Array) -> BankEstimate:
+    def _moves(self) -> Array:
+        """From `late` and the inputs u (m,) applied since to the next `late`, shape (n + l + m, n + l + 2m).
+
+        A plant with modes that grow cannot wait: there it stays zero.
+        """
+        model = self.model
+        n, m, l = model.n_states, model.n_inputs, model.n_outputs
+        kept, grows = np.exp(-1 / LATE), np.abs(model.poles()).max(initial=0.0) > 1 + RUNS_AWAY
+        x, h, before, u = np.split(np.eye(n + l + 2 * m), np.cumsum([n, l, m]))
+        moves = 0.0 * u if grows else u - before
+        x = kept * model.A @ x + model.B[:, :m] @ moves
+        return np.vstack([x, kept * (h + model.C @ x + model.D[:, :m] @ moves), u])
+
+    def _estimate(
+        self, members: Array, weights: Array, usual: Array, scale: Array, late: Array
+    ) -> BankEstimate:
         plan = (weights[..., None] * members).reshape((*weights.shape[:-1], -1)).dot(self._mixture)
         x, at_inputs, at_outputs = self._parts
         return BankEstimate(
-            plan[..., x], plan[..., at_outputs], plan[..., at_inputs], members, weights, usual, scale
+            plan[..., x], plan[..., at_outputs], plan[..., at_inputs], members, weights, usual, scale, late
         )
 
     def _seen(self, members: Array) -> Array:

@@ -37,12 +37,15 @@ class BankEstimate(Estimate):
         weights: how likely each hypothesis is, shape (B,), with sum 1.
         usual: how likely each one is on average of the samples without jumps, shape (B,), with sum 1.
         scale: variance of the innovations beside what the noise told leads to, and how many samples have shown it.
+        late: what the inputs' moves of the last samples did to the states (n,) and to the outputs (l,), and the inputs
+            (m,) since, shape (n + l + m,).
     """
 
     members: Array
     weights: Array
     usual: Array
     scale: Array
+    late: Array
 
 
 class Filters(NamedTuple):
@@ -51,12 +54,14 @@ class Filters(NamedTuple):
     Attributes:
         gains: shape (B, n + 2k, l).
         whiten: W with |W e|^2 = e' S^-1 e, shape (B, l, l).
+        precisions: the diagonals of S^-1, shape (B, l).
         log_scale: -1/2 log det S, shape (B,).
         believed: how many outputs are.
     """
 
     gains: Array
     whiten: Array
+    precisions: Array
     log_scale: Array
     believed: int
 

@@ -324,7 +324,7 @@ class Regulator:
         if judged.newly_stuck.any():
             estimate = estimator.with_loads(estimate, judged.newly_stuck, sensors.loads)
         if judged.believed.any():
-            estimate = estimator.corrected(estimate, innovation, judged.believed, movement)
+            estimate = estimator.corrected(estimate, innovation, judged.believed)
         return estimate, judged, sensors
 
 
