@@ -77,6 +77,24 @@ def test_step_responses_err_by_about_their_standard_deviations():
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.6
 
 
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-5, 1e4)])
+def test_what_a_model_lacks_is_uncertain(units):
+    """Forced to one state, a model lacks a mode, which leaving out segments does not show."""
+    plant = StateSpace.from_first_order(
+        gain=[[1.0, 0.5], [0.4, 2.0]], time_constant=[[2.0, 50.0], [60.0, 3.0]], dead_time=0.0, dt=1.0
+    )
+    u = prbs(order=9, hold=6, inputs=2, samples=2000, seed=1)
+    y = plant.response(plant.u_op + u)
+    y = y + 0.1 * np.random.default_rng(1).standard_normal(y.shape)
+    fitted = n4sid(
+        IOData(u * units[0], y * units[1], 1.0), order=2, detrend="constant", feedthrough=False, delays=0
+    )
+    error = fitted.model.step_response(150)[-1] * units[0] / units[1] - plant.step_response(150)[-1]
+    ratio = error / (fitted.uncertainty(150)[-1] * units[0] / units[1])
+    assert np.abs(error).max() > 0.05
+    assert np.abs(ratio).max() < 3
+
+
 def test_uncertainty_falls_with_the_length_of_the_record_and_grows_with_noise():
     def typical(**options):
         fitted = n4sid(record(3, **options), feedthrough=False)

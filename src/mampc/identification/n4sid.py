@@ -19,7 +19,7 @@ from mampc.identification.estimate import DEGREES, Settings
 from mampc.identification.parts import Part, assembled, part_residuals
 from mampc.identification.scaling import Scaled, scaled
 from mampc.identification.subspace import WEIGHTINGS
-from mampc.identification.uncertainty import jackknife
+from mampc.identification.uncertainty import jackknife, unmodelled
 from mampc.identification.validation import Validation, fit_to_all, validate
 from mampc.systems.noise import Noise
 from mampc.systems.state_space import StateSpace
@@ -67,7 +67,8 @@ class Identified:
         """Standard deviations of the step response, shape (samples, l, m + d); see `StateSpace.step_response`.
 
         The model is estimated again, trend, dead times and order as they are, without one segment of the record
-        after another. What all of these share, such as a disturbance that moved with an input, does not show.
+        after another; what it may lack beyond is sought in what it leaves of the record (see `unmodelled`). A
+        disturbance that moved with an input does not show.
 
         Args:
             samples: of the response.
@@ -78,9 +79,10 @@ class Identified:
         """
         as_whole("segments", segments, 3)
         as_whole("samples", samples, 1)
-        return jackknife(
+        chance = jackknife(
             self._estimate.records, segments, lambda rest: self._estimate.response(rest, samples)
         )
+        return np.sqrt(chance**2 + self._estimate.lacking(samples))
 
     def validate(self, data: IOData) -> Validation:
         """Simulate the model on another record, drifts set aside as they were here; see `mampc.validate`."""
@@ -170,7 +172,7 @@ def n4sid(
         notes=tuple(notes),
         fit=quality.fit if len(given) == 1 else fit_to_all(model, given, drift=drift),
         stabilised=any(part.stabilised for part in parts),
-        _estimate=_Estimate(records, settings, choice, tuple(len(part.A) for part in parts), first),
+        _estimate=_Estimate(records, settings, choice, tuple(parts), first),
     )
 
 
@@ -181,13 +183,21 @@ class _Estimate:
     records: Scaled
     settings: Settings
     choice: Choice
-    orders: tuple[int, ...]
+    parts: tuple[Part, ...]
     like: IOData
 
     def response(self, records: Scaled, samples: int) -> Array:
         """The step response of the model of other records, shape (samples, l, m + d)."""
-        parts = estimated(records, self.settings, self.choice, orders=self.orders)
+        parts = estimated(records, self.settings, self.choice, orders=[len(part.A) for part in self.parts])
         return assembled(parts, records, self.like).step_response(samples)
+
+    def lacking(self, samples: int) -> Array:
+        """Mean square of what the step response may lack, in the same shape."""
+        if self.choice.predictor:
+            return np.zeros((samples, *self.choice.delays.shape))
+        records = self.records
+        units = records.y_spread[:, None] / records.u_spread
+        return unmodelled(self.parts, records, samples) * units**2
 
 
 def _under_feedback(records: Scaled) -> bool:

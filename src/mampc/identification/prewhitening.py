@@ -32,8 +32,8 @@ def prewhitened(records: Scaled, first: int) -> Scaled:
     a = denominator(records.u, records.y, lags, 0, first)
     return replace(
         records,
-        u=tuple(_filtered(u, a) for u in records.u),
-        y=tuple(_filtered(y, a) for y in records.y),
+        u=tuple(filtered_by(u, a) for u in records.u),
+        y=tuple(filtered_by(y, a) for y in records.y),
     )
 
 
@@ -90,7 +90,7 @@ def _stable(a: Array) -> Array:
     return np.concatenate([stable, np.zeros(len(a) - len(stable))])  # leading zeros have no roots
 
 
-def _filtered(signal: Array, a: Array) -> Array:
+def filtered_by(signal: Array, a: Array) -> Array:
     """signal[k] - sum a_i signal[k - i], from the first sample with a whole past on."""
     from scipy.signal import lfilter
 
