@@ -259,3 +259,11 @@ def test_a_stamp_that_is_none_is_left_out_and_told(tmp_path, wrong):
     export = read(tmp_path, text(rows(times)))
     assert [len(record) for record in export.records] == [11]
     assert told(export, "no time can be read in row 13")
+
+
+def test_times_of_their_own_for_each_column_are_refused(tmp_path):
+    lines = [[time, u, time.replace(":00", ":07"), y] for time, u, y in rows()]
+    with pytest.raises(
+        MampcError, match="received 2 called 'time' with different times; export all columns at the same"
+    ):
+        read(tmp_path, text(lines, header=("time", "u", "time", "y")))

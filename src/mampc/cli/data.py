@@ -12,7 +12,9 @@ from mampc.base.errors import MampcError
 from mampc.cli.app import app
 from mampc.cli.console import complain, console_for_tables, print_list, progress
 
-Inputs = Annotated[str, typer.Option(help="Input columns, separated by commas.")]
+Inputs = Annotated[
+    str, typer.Option(help="Input columns, separated by commas; a name with a comma in quotation marks.")
+]
 Outputs = Annotated[str, typer.Option(help="Output columns, separated by commas.")]
 Disturbances = Annotated[str, typer.Option(help="Columns of inputs that are measured and not manipulated.")]
 SampleTime = Annotated[

@@ -176,6 +176,11 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
     ] or found  # others hold the export's own span
     if len(found) > 1 and _all_alike([sheet.column(at) for at in found]):
         findings.note(f"{len(found)} columns of times are the same, as {sheet.header[found[0]]!r}")
+    elif len(found) > 1 and len({sheet.header[at] for at in found}) == 1:
+        findings.doubt(
+            f"expected one column of times, received {len(found)} called {sheet.header[found[0]]!r} with different "
+            "times; export all columns at the same times"
+        )
     elif len(found) > 1:
         listed = ", ".join(repr(sheet.header[at]) for at in found)
         findings.doubt(
