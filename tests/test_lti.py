@@ -1,6 +1,5 @@
 """Linear models: what they accept, and agreement with python-control and scipy.signal."""
 
-import json
 from dataclasses import replace
 
 import control
@@ -9,8 +8,7 @@ import pytest
 import scipy.signal
 
 from builders import random_model
-from mampc import MampcError, Names, StateSpace, linearise
-from mampc.systems.model_file import MODEL_FILE_LIMIT
+from mampc import MampcError, Names, StateSpace
 
 A, B, C, D = np.diag([0.5, 0.8]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1))
 CONTINUOUS = [[-1.0, 0.5], [0.0, -3.0]], [[1.0], [2.0]], [[1.0, 0.0]], [[0.0]]
@@ -339,134 +337,3 @@ def test_the_response_of_a_continuous_model_is_refused():
 def test_inputs_of_another_width_or_not_finite_are_refused(u):
     with pytest.raises(MampcError, match=r"u: expected .* received"):
         random_model(0).response(u)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_saving_and_loading_gives_the_same_numbers(tmp_path, seed):
-    model = random_model(seed, feedthrough=True)
-    model.save(tmp_path / "model.json")
-    loaded = StateSpace.load(tmp_path / "model.json")
-    for name in ("A", "B", "C", "D", "u_op", "y_op"):
-        assert np.array_equal(getattr(loaded, name), getattr(model, name))
-    assert (loaded.dt, loaded.names) == (model.dt, model.names)
-    assert [path.name for path in tmp_path.iterdir()] == ["model.json"]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"a,b\n1,2\n", b"[1, 2]", b"[" * 100_000, b'{"dt": ' + b"9" * 5000 + b"}", b"\xff\xfe\x00"],
-    ids=lambda content: repr(content[:10]),
-)
-def test_loading_anything_else_names_the_file(tmp_path, content):
-    (tmp_path / "model.json").write_bytes(content)
-    with pytest.raises(MampcError, match=r"model\.json: expected"):
-        StateSpace.load(tmp_path / "model.json")
-
-
-@pytest.mark.parametrize("key", ["format", "A", "D", "dt", "u_op", "names"])
-def test_a_model_file_with_a_part_missing_is_refused(tmp_path, key):
-    path = tmp_path / "model.json"
-    random_model(0).save(path)
-    content = json.loads(path.read_text())
-    del content[key]
-    path.write_text(json.dumps(content))
-    with pytest.raises(MampcError, match=r"model\.json: expected"):
-        StateSpace.load(path)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"format": "mampc-model-9"},
-        {"names": 5},
-        {"names": {"inputs": [["u"], ["v"]], "outputs": ["y", "z"]}},
-        {"names": {"inputs": ["u", "v"], "outputs": ["y", "z"], "colours": ["red"]}},
-        {"A": [[0.5, 1.0]]},
-        {"A": [[float("nan")] * 3] * 3},
-        {"A": [[10**400] * 3] * 3},
-        {"B": "one"},
-        {"dt": -1.0},
-        {"dt": 10**400},
-        {"dt": None},
-    ],
-    ids=lambda changes: str(changes)[:30],
-)
-def test_a_model_file_with_a_part_that_does_not_fit_is_refused(tmp_path, changes):
-    path = tmp_path / "model.json"
-    random_model(0).save(path)
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-    with pytest.raises(MampcError, match=r"model\.json: .*expected"):
-        StateSpace.load(path)
-
-
-def test_missing_files_directories_and_huge_files_are_refused(tmp_path):
-    huge = tmp_path / "huge.json"
-    with huge.open("wb") as file:
-        file.truncate(MODEL_FILE_LIMIT + 1)
-    with pytest.raises(MampcError, match="at most 16 MiB"):
-        StateSpace.load(huge)
-    for path in (tmp_path, tmp_path / "missing.json"):
-        with pytest.raises(MampcError, match="expected a readable mampc model file"):
-            StateSpace.load(path)
-
-
-class Pendulum:
-    """A damped pendulum driven by a torque; at rest it hangs where gravity balances the torque."""
-
-    def derivative(self, x, u):
-        return np.array([x[1], u[0] - np.sin(x[0]) - 0.1 * x[1]])
-
-    def output(self, x, u):
-        return np.array([x[0] ** 2 + 3 * u[0]])
-
-    def steady_state(self, u=None):
-        return np.array([np.arcsin(u[0]), 0.0])
-
-
-def test_linearisation_matches_derivatives_by_hand():
-    angle = 0.5
-    model = linearise(Pendulum(), [np.sin(angle)])
-    np.testing.assert_allclose(model.A, [[0, 1], [-np.cos(angle), -0.1]], atol=1e-9)
-    np.testing.assert_allclose(model.B, [[0], [1]], atol=1e-9)
-    np.testing.assert_allclose(model.C, [[2 * angle, 0]], atol=1e-9)
-    np.testing.assert_allclose(model.D, [[3]], atol=1e-9)
-    np.testing.assert_allclose([model.u_op[0], model.y_op[0]], [np.sin(angle), 0.25 + 3 * np.sin(angle)])
-    assert not model.is_discrete
-
-
-class Neutralisation:
-    """A stirred tank in which acid and base meet: its state is a surplus of charge in mol/l, its output the pH."""
-
-    def __init__(self, unit=1.0):
-        self.unit = unit
-
-    def derivative(self, x, u):
-        return self.unit * (1.2e-6 - 1e-4 * u) - 1e-3 * x
-
-    def output(self, x, u):
-        half = x / self.unit / 2
-        acid = np.hypot(half, 1e-7)
-        return -np.log10(acid + half) if half[0] >= 0 else np.log10(acid - half) + 14.0
-
-    def steady_state(self, u=None):
-        return self.unit * (1.2e-3 - 0.1 * np.asarray(u))
-
-
-@pytest.mark.parametrize("u", [0.011, 0.012, 0.012 - 1e-7, 0.013])
-@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
-def test_linearisation_does_not_depend_on_units(u, unit):
-    model = linearise(Neutralisation(unit), [u])
-    surplus = 1.2e-3 - 0.1 * u
-    slope = -1 / (2 * np.log(10) * np.hypot(surplus / 2, 1e-7))
-    np.testing.assert_allclose(model.C, [[slope / unit]], rtol=1e-8)
-    np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [-1e-3, -1e-4 * unit], rtol=1e-9)
-
-
-def test_linearisation_takes_no_step_out_of_a_function_s_range():
-    class Narrow(Pendulum):
-        def output(self, x, u):
-            if abs(x[0]) > 1e-3:
-                raise ValueError("broken")
-            return np.array([np.sin(x[0])])
-
-    np.testing.assert_allclose(linearise(Narrow(), [0.0]).C, [[1.0, 0.0]], rtol=1e-8)
