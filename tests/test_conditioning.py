@@ -33,6 +33,12 @@ def test_proven_optima_are_those_of_brute_force_in_120_digits(seed, moves_limite
     holds(case_of(seed, moves_limited=moves_limited))
 
 
+@pytest.mark.parametrize("seed", [237, 432, 452, 527, *seeds(400, quick=10)])
+def test_the_tree_proves_no_more_than_the_table(seed, monkeypatch):
+    monkeypatch.setattr(ranking, "LARGEST_TABLE", 0)
+    holds(case_of(seed))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("moves_limited", [False, True])
 @pytest.mark.parametrize("seed", range(30, 400))

@@ -67,6 +67,8 @@ class LocalSearch:
             except np.linalg.LinAlgError:  # moves that rounding cannot tell apart
                 break
             d, B, w = -(W @ f[held]), W @ rows, np.diag(W)
+            if not (w > 0).all():
+                break
             r, q = f + d @ rows, self._diagonal - (rows * B).sum(axis=0)
             q[held] = TAKEN
             loss = 0.5 * d * d / w

@@ -40,7 +40,7 @@ from mampc.program.restriction import Restriction
 from mampc.program.sample import Indices, LeastSquares, Parts, PatternOptimum, Sample
 from mampc.program.tail import square_root, tail
 
-ILL_CONDITIONED = 3e6  # condition, or growth of predictions, from which on a proof has to look at rounding
+ILL_CONDITIONED = 1e6  # condition, or growth of predictions, from which on a proof has to look at rounding
 SINGULAR = 1e13  # condition of U, of unit columns, from which on rounding determines some move
 
 
