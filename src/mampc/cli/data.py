@@ -46,6 +46,10 @@ Fill = Annotated[
         help="Make up as many samples in a row where they are missing: inputs held, outputs on lines."
     ),
 ]
+OnChange = Annotated[
+    list[str] | None,
+    typer.Option(help="A column that is stored only when it changes: its last value holds; repeat it."),
+]
 
 
 @app.command()
@@ -65,6 +69,7 @@ def inspect(
     good: Good = None,
     ranges: Ranges = None,
     fill: Fill = 0,
+    on_change: OnChange = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Picture; default NAME-columns.png beside the file.")
     ] = None,
@@ -87,7 +92,7 @@ def inspect(
     reading = _reading(
         inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
-        encoding=encoding,
+        encoding=encoding, on_change=tuple(on_change or ()),
     )  # fmt: skip
     target = export.parent / f"{export.stem}-columns.png" if out is None else out
     with progress() as show:
@@ -134,6 +139,7 @@ def identify(
     good: Good = None,
     ranges: Ranges = None,
     fill: Fill = 0,
+    on_change: OnChange = None,
     order: Annotated[int | None, typer.Option(help="Model order; default from the singular values.")] = None,
     weighting: Annotated[str, typer.Option(help="cva, n4sid or moesp.")] = "cva",
     block_rows: Annotated[
@@ -173,7 +179,7 @@ def identify(
     reading = _reading(
         inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
-        encoding=encoding,
+        encoding=encoding, on_change=tuple(on_change or ()),
     )  # fmt: skip
     settings = {
         "order": order, "weighting": weighting, "block_rows": block_rows, "feedthrough": feedthrough,

@@ -16,6 +16,7 @@ from mampc.identification.export.findings import Findings
 from mampc.identification.export.grid import make_grid, pieces
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Column, read_numbers, says_numbers
+from mampc.identification.export.on_change import hint_of_changes, hold_last
 from mampc.identification.export.quality import drop_bad_quality, is_quality
 from mampc.identification.export.reading import ReadingOptions, listed, readings
 from mampc.identification.export.sheet import Sheet
@@ -123,6 +124,10 @@ def inspect_export(
     for column in columns:
         if column.marks:
             findings.note(str(column))
+    if wanted:
+        on_change = listed(options.get("on_change", ()))
+        hint_of_changes(values, list(positions), on_change, findings)
+        hold_last(sheet, positions, on_change, clock, values, findings)
     grid = make_grid(clock, values, sheet.numbers, dt, findings)
     order, seconds = (np.arange(len(values)), np.arange(len(values)) * 1.0)
     lengths: tuple[int, ...] = (len(values),)

@@ -20,6 +20,7 @@ from mampc.identification.export.findings import Findings, counted
 from mampc.identification.export.grid import STRAYING, Grid, bridged, make_grid, pieces, resampled
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Reading, read_numbers
+from mampc.identification.export.on_change import hint_of_changes, hold_last, sampled
 from mampc.identification.export.quality import drop_bad_quality, quality_columns
 from mampc.identification.export.stamps import TimeReading
 from mampc.identification.export.suspects import note_suspects
@@ -40,6 +41,7 @@ class ReadingOptions(TypedDict, total=False):
     ranges: lowest and highest believable value of columns, {"TI101": (0.0, 200.0)}.
     fill: up to so many samples in a row may be made up where they are missing: inputs are held, outputs lie on lines;
         default none.
+    on_change: columns that are stored only when they change: their last value holds in empty cells.
     """
 
     time: str | None
@@ -52,6 +54,7 @@ class ReadingOptions(TypedDict, total=False):
     good: Sequence[str]
     ranges: Mapping[str, tuple[float, float]]
     fill: int
+    on_change: Sequence[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +112,7 @@ def read_export(
     how, reading = readings(options, wanted)
     fill = as_whole("fill", options.get("fill", 0), 0)
 
-    table = _read_table(source, names, how, reading, options, findings)
+    table = _read_table(source, names, how, reading, options, dt, findings)
     grid = make_grid(table.clock, table.values, table.numbers, dt, findings)
     findings.require_none()
     assert grid is not None  # else there is a doubt
@@ -119,8 +122,8 @@ def read_export(
         counts = ", ".join(f"{count} of {name}" for name, count in zip(wanted, filled, strict=True))
         raise MampcError(
             f"{origin}: expected consecutive rows with a number in every column, received numbers in {counts} in "
-            f"{len(table.values)} rows; export all columns at the same times, or pass how many values in a row may be "
-            "made up (fill, --fill)"
+            f"{len(table.values)} rows; export all columns at the same times, name those that are stored only when "
+            "they change (on_change, --on-change), or pass how many values in a row may be made up (fill, --fill)"
         )
     return Export(tuple(records), tuple(findings.notes), tuple(findings.changes), tuple(starts))
 
@@ -140,6 +143,7 @@ def _read_table(
     how: TimeReading,
     reading: Reading,
     options: ReadingOptions,
+    dt: float | None,
     findings: Findings,
 ) -> _Table:
     wanted = (*names.inputs, *names.disturbances, *names.outputs)
@@ -154,7 +158,12 @@ def _read_table(
     for column in columns:
         if column.marks:
             findings.change(str(column))
-    return _Table(replace(names, units=units), clock, values, sheet.numbers)
+    on_change = listed(options.get("on_change", ()))
+    hint_of_changes(values, wanted, on_change, findings)
+    hold_last(sheet, positions, on_change, clock, values, findings)
+    held = np.array([name in on_change for name in wanted])
+    clock, values, numbers = sampled(clock, values, sheet.numbers, held, dt, findings)
+    return _Table(replace(names, units=units), clock, values, numbers)
 
 
 def _cut(table: _Table, grid: Grid, fill: int, findings: Findings) -> tuple[list[IOData], list[str]]:
