@@ -13,7 +13,6 @@ Results and what made them go to benchmarks/results/attention.json, tables and t
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import platform
@@ -32,6 +31,7 @@ from attention_limits import SCENARIOS, limit
 from mampc import rivals
 from mampc.compare.fronts import Point, moves_at
 from mampc.compare.journal import Journal
+from measuring import options
 
 RESULTS = Path(__file__).parent / "results"
 TUNING, EVALUATION = range(1000, 1004), range(8)  # seeds
@@ -243,9 +243,7 @@ def collect(journals: dict[str, Journal], quick: bool) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer seeds and settings, to see that it runs")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--plants", nargs="*", default=[], help="only these")

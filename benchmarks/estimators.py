@@ -9,13 +9,12 @@ without and with later data. Nothing is tuned: with the settings of plain MPC, a
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
 import mampc
 from attention_cases import Case, cases, load_of, problem_of, reference_of
 from mampc.compare.fronts import Point, moves_at
+from measuring import options
 
 LOADS = ("none", "steps", "wandering", "sinusoidal")
 PRICES, SEEDS, RATIO = 100 * np.geomspace(1 / 30, 30, 7), range(2000, 2003), 1.25
@@ -52,9 +51,7 @@ def points(case: Case, load: str, made: list[mampc.Regulator], name: str) -> lis
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("--plants", nargs="*", default=[*cases()], help="only these")
     ratios: dict[str, list[list[float]]] = {setting: [] for setting in SETTINGS}
     for name in parser.parse_args().plants:

@@ -10,7 +10,6 @@ the error of plain MPC with the model as it was, in percent of its moves, with t
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +20,7 @@ from attention import BASELINE, EVALUATION, RATIO, measured, regulators_of
 from attention_cases import Case, cases, load_of, reference_of
 from mampc.compare.fronts import moves_at
 from mampc.loop.learnt_gains import with_gains
+from measuring import options
 
 OFF = 0.2
 STRUCTURE = ("bank", 0.0, 0.3)
@@ -60,9 +60,7 @@ def models(case: Case, factors: np.ndarray) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("--plants", nargs="*", default=["Wood-Berry", "3 x 3 column"])
     parser.add_argument("--draws", type=int, default=3)
     given = parser.parse_args()

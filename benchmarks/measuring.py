@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import statistics
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -15,6 +16,11 @@ from mampc.controllers.controller import Controller
 
 SAMPLES = 145
 LAMBDA = 0.1
+
+
+def options(text: str | None) -> argparse.ArgumentParser:
+    """A parser of the options of a benchmark, whose help is the text of its file as it stands."""
+    return argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 class Row(NamedTuple):

@@ -12,7 +12,6 @@ what it would suffer without any rank.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -22,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import mampc
-from measuring import Comparison, interleaved
+from measuring import Comparison, interleaved, options
 
 HORIZON = 20
 FAR = 1e3  # limits that are there, so that a sample may have its own
@@ -140,9 +139,7 @@ def found(kind: str, seeds: int) -> tuple[list[list[str]], Comparison]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=100, help="instances of each kind")
     arguments = parser.parse_args()
     table = Table(

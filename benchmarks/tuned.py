@@ -9,19 +9,16 @@ a mean over all that tuning drew, so that single kinds may lie above it.
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
 import mampc
 from attention import EVALUATION
 from attention_cases import LOADS, cases, load_of, reference_of
+from measuring import options
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("--plants", nargs="*", default=["3 x 3 column", "tank"])
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()

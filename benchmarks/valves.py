@@ -11,7 +11,6 @@ the error of the other.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +22,7 @@ from rich.table import Table
 from mampc.base.tolerances import SAME
 from mampc.study import Study, load_study
 from mampc.study.running import Prepared, prepare, regulator_of, run_seeds
+from measuring import options
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "sticking-valves.toml"
 PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
@@ -57,9 +57,7 @@ def outcome(study: Study, prepared: Prepared, name: str, price: float, seeds: in
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("--seeds", type=int, default=4, help="of loads and noise")
     arguments = parser.parse_args()
     study = load_study(EXAMPLE)

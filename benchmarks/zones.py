@@ -14,7 +14,6 @@ width with it, each with a price per move, over the same seeds; the price goes t
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +24,7 @@ from rich.progress import track
 from rich.table import Table
 
 import mampc
-from measuring import closed_loop, interleaved, steps_of, tank_problem
+from measuring import closed_loop, interleaved, options, steps_of, tank_problem
 
 SIGMA = 0.1
 PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
@@ -136,9 +135,7 @@ def times() -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("--figure", action="store_true", help="draw docs/images/zones.svg as well")
     parser.add_argument("--times", action="store_true", help="only compare times of steps")
     parser.add_argument("--kalman", action="store_true", help="one Kalman filter in place of the load bank")
