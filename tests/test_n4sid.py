@@ -21,6 +21,7 @@ from random_systems import markov, noise_free, noisy_record, random_system, syst
 from seeds import examples, seeds
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
+ONE_QUICK = ("cva", *(pytest.param(name, marks=pytest.mark.slow) for name in WEIGHTINGS[1:]))
 SIZES = [(2, 1, 1), (4, 2, 2), (5, 2, 3)]  # states, inputs, outputs
 
 
@@ -214,7 +215,7 @@ def test_unseen_data_is_explained_better_than_by_other_programs(name, method):
     assert medians[method] >= max(medians["SLICOT"], medians["nfoursid"])
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("weighting", ONE_QUICK)
 def test_a_record_taken_in_small_parts_gives_the_same_model(monkeypatch, weighting):
     data = noisy_record(random_system(1, 4, 2, 2, True), 1)[0]
     whole = n4sid(data, weighting=weighting)
@@ -363,7 +364,7 @@ def tank_record(seed):
     return mampc.excite(mampc.plants.QuadrupleTank(), u, dt=10, noise=0.1, seed=1)
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("weighting", ONE_QUICK)
 @pytest.mark.parametrize("seed", seeds(3, quick=1))
 def test_the_order_of_the_tank_is_four(seed, weighting):
     fitted = n4sid(tank_record(seed), weighting=weighting)
