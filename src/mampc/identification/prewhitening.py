@@ -19,7 +19,7 @@ from mampc.identification.scaling import Scaled
 from mampc.identification.triangular import fold, solve
 
 LONGEST = 30  # coefficients of the filter
-ITERATIONS = 30
+ITERATIONS = 20
 SETTLED = 1e-6  # change of a coefficient
 EDGE = 1 - 1e-9  # largest pole
 EACH = 20  # samples for each coefficient of the ARX model, at least
