@@ -124,9 +124,22 @@ def test_with_longer_delays_missing_the_bank_does_better_than_the_filter(delay):
     assert cost[0] < 0.5 * cost[1]
 
 
-def test_on_a_double_integrator_that_the_model_knows_the_bank_does_better_than_the_filter():
-    """Under jumping loads its output goes far; what goes on by itself is no reason to correct less."""
-    model = mampc.StateSpace([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]], None, 1.0)
+DOUBLE = mampc.StateSpace([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]], None, 1.0)
+UNSTABLE = mampc.StateSpace([[1.08, 0.2], [0.0, 0.7]], [[0.05], [0.3]], [[1.0, 0.0]], None, 1.0)
+LEVEL = mampc.StateSpace([[1.0, 0.3], [0.0, 0.7]], [[0.05], [0.3]], [[1.0, 0.0]], None, 1.0)
+LATER = mampc.StateSpace(  # by two samples
+    [[1.0, 0.3, 0.05, 0.0], [0.0, 0.7, 0.3, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]],
+    [[0.0], [0.0], [0.0], [1.0]], [[1.0, 0.0, 0.0, 0.0]], None, 1.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("model", "plant"),
+    [(DOUBLE, DOUBLE), (UNSTABLE, UNSTABLE), (LEVEL, LATER)],
+    ids=["double integrator", "unstable", "late actuator"],
+)
+def test_on_plants_that_run_away_the_bank_does_better_than_the_filter(model, plant):
+    """Under jumping loads outputs go far; what goes on by itself is no reason to correct less."""
     problem = mampc.TrackingProblem(
         model, prediction_horizon=20, control_horizon=3, move_weight=0.1,
         limits=mampc.Limits(u_min=-5.0, u_max=5.0),
@@ -134,8 +147,8 @@ def test_on_a_double_integrator_that_the_model_knows_the_bank_does_better_than_t
     error = []
     for estimator in (LoadBank(model, noise=0.05), KalmanFilter.offset_free(model, measurement_noise=0.05)):
         batch = mampc.simulate_batch(
-            model, mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator), np.zeros((150, 1)),
+            plant, mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator), np.zeros((150, 1)),
             noise=0.05, seeds=range(2), loads=[mampc.loads.RandomSteps(size=0.2, every=40.0)], progress=False,
         )  # fmt: skip
         error.append(np.square(batch.y).mean())
-    assert error[0] < error[1]
+    assert error[0] < 0.8 * error[1]
