@@ -131,7 +131,7 @@ def chosen(
         if feedback:
             return bool(np.isfinite(score.error))
         if trends[k] == "whitened":
-            return min(score.walk, first.walk) > WALK and score.level <= first.level + CLEARLY
+            return min(score.walk, first.walk) > WALK and score.level <= first.level + RIVAL
         return score.level <= first.level + CLEARLY or score.error < first.error - CLEARLY
 
     fair = [k for k in range(len(trends)) if is_fair(k)]

@@ -32,6 +32,7 @@ from mampc.identification.subspace import (
     supported_order,
 )
 
+NEAR_BEST = 1.02  # simulation errors that are as good as equal
 ROUNDING = 1e-6  # of the spread: smaller errors are as good as none
 LITTLE = 0.2  # a filter's pole that makes no difference
 EQUATIONS, LEAST = 15_000, 1000  # in which orders are compared, and samples
@@ -126,7 +127,7 @@ def finished(
         part = attempt(n)
         return residuals(part.A, part.C, part.fit, few)
 
-    part = attempt(_likeliest(left, orders, few.u[0].shape[1]))
+    part = attempt(_likeliest(left, orders, few.u[0].shape[1], white=trend == "whitened"))
     if few is not seen:
         part = part._replace(fit=fitted(part.A, part.C))
     part = _with_integrators(
@@ -137,8 +138,12 @@ def finished(
     return _without_idle_constant(part, seen, settings.feedthrough) if trend == "constant" else part
 
 
-def _likeliest(left: Callable[[int], Sequence[Array]], orders: Sequence[int], inputs: int) -> int:
-    """The order of the least Schwarz criterion, from what each leaves of the records.
+def _likeliest(
+    left: Callable[[int], Sequence[Array]], orders: Sequence[int], inputs: int, *, white: bool
+) -> int:
+    """The order of the least Schwarz criterion, or a larger one: the smallest whose errors are within 2 % of the best.
+
+    Where residuals are `white` the criterion counts them rightly, and decides alone.
 
     Every order up to six is tried, every second or third beyond, and those beside the one that these point to.
     Residuals count as so many samples as they amount to, given how the fullest model's are correlated.
@@ -160,7 +165,12 @@ def _likeliest(left: Callable[[int], Sequence[Array]], orders: Sequence[int], in
     information = cache(lambda n: float(samples @ variance(n) + price * n))
     at = coarse.index(min(coarse, key=information))
     lower, upper = coarse[max(at - 1, 0)], coarse[min(at + 1, len(coarse) - 1)]
-    return min((n for n in orders if lower <= n <= upper), key=information)
+    likeliest = min((n for n in orders if lower <= n <= upper), key=information)
+    if white:
+        return likeliest
+    best = min(variance(n).sum() for n in coarse)
+    alike = next(n for n in coarse if variance(n).sum() <= best + 2 * outputs * np.log(NEAR_BEST))
+    return max(likeliest, alike)
 
 
 def _with_integrators(
