@@ -11,7 +11,7 @@ tell: loads are told in units of the noise, so noise that was told wrongly chang
 
 A plant may do what inputs ask for later, or less of it, than its model says. While outputs lag behind what the inputs'
 moves of the last samples did, h, their innovations vary by 1 + h' diag(S_b^-1) h / l times as much, h of the outputs
-that lag alone, and what is corrected falls by as much. Two standard deviations are forgiven at most: what no delay
+that lag alone, and what is corrected falls by as much. Three standard deviations are forgiven at most: what no delay
 explains is corrected in full; loads, and what goes on by itself, are followed at once. The factor of the noise counts
 up to one here: errors of the model, which make it larger, are no reason for less caution.
 
@@ -39,7 +39,7 @@ NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guess
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
 LATE = 5.0  # samples since when a plant may lag behind its model, of those that count less and less
-FORGIVEN = 2.0  # standard deviations of that
+FORGIVEN = 3.0  # standard deviations of that
 SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
