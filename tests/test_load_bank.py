@@ -195,6 +195,16 @@ def test_units_decide_nothing(rules):
     np.testing.assert_allclose(LoadBank.for_problem(other).noise, of_y * LoadBank.for_problem(problem).noise)
 
 
+def test_the_noise_that_is_guessed_does_not_depend_on_dead_times():
+    for dead_time in (0.0, 19.0, 60.0):
+        model = mampc.StateSpace.from_first_order(gain=2.0, time_constant=5.0, dead_time=dead_time, dt=1.0)
+        problem = mampc.TrackingProblem(
+            model, prediction_horizon=70, control_horizon=2, limits=mampc.Limits(u_min=0.0, u_max=10.0)
+        )
+        reach = 10.0 * 2.0 * (1 - np.exp(-20 / 5))
+        np.testing.assert_allclose(LoadBank.for_problem(problem).noise, 0.002 * reach, rtol=0.01)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_units_of_states_decide_nothing(name):
     """Over eight decades: gains in outputs and in loads are the same, of the bank and of the Kalman filter."""

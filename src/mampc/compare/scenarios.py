@@ -16,7 +16,7 @@ from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError
 from mampc.loop.batch import simulate_batch
 from mampc.loop.disturbances import input_units, response_within_reach
-from mampc.loop.load_bank import NOISE_OF_REACH
+from mampc.loop.load_bank import guessed_noise
 from mampc.loop.loads import Coloured, Load, RandomSteps, RandomWalk, drawn
 from mampc.loop.regulator import Regulator
 from mampc.program.problem import Limits, TrackingProblem
@@ -75,11 +75,7 @@ class Surroundings:
         noise = white_noise(model.noise) if noise is None else noise
         guessed = noise is None
         if noise is None:
-            noise = NOISE_OF_REACH * np.abs(response_within_reach(model)) @ _range(problem, "noise")
-            if not (noise > 0).all():
-                raise MampcError(
-                    f"noise: expected inputs that move every output, received a reach of {noise}"
-                )
+            noise = guessed_noise(problem)
         sizes = as_vector("noise", noise, l)
         if (sizes <= 0).any():
             raise MampcError(f"noise: expected positive standard deviations, received {sizes}")
@@ -323,14 +319,3 @@ def _steady_gain(model: StateSpace) -> Array:
     except MampcError:
         gain = model.step_response(11)[-1]
     return gain[:, : model.n_inputs]
-
-
-def _range(problem: TrackingProblem, name: str) -> Array:
-    """Ranges of the inputs, shape (m,); `MampcError` where they have none."""
-    width: Array = problem.limits.u_max - problem.limits.u_min
-    if not (np.isfinite(width) & (width > 0)).all():
-        raise MampcError(
-            f"{name}: expected values, or limits u_min and u_max of all inputs to derive them from, "
-            f"received the ranges {width}"
-        )
-    return width

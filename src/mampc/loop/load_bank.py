@@ -28,6 +28,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
+from mampc.loop.disturbances import response_within_reach
 from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.hypotheses import HYPOTHESES, RUNS_AWAY, Hypothesis, Loads, Member
 from mampc.loop.mixing import IMPOSSIBLE, BankEstimate, Filters, Mixing
@@ -115,22 +116,12 @@ class LoadBank(Estimator):
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
         """A bank for the model of a problem, whose limits give a guess of the noise where nobody tells it.
 
-        The guess is a 500th of what the whole range of the inputs does to an output within 20 samples.
-
         Raises:
-            MampcError: as for `LoadBank`; and inputs without limits where the noise has to be guessed.
+            MampcError: as for `LoadBank`; and as `guessed_noise` where the noise has to be guessed.
         """
-        model, limits = problem.model, problem.limits
-        if noise is None and white_noise(model.noise) is None:
-            response = np.abs(model.step_response(21)[:, :, : model.n_inputs]).max(axis=0)
-            moved = response > 0
-            reach = np.where(moved, response, 0.0) @ np.where(
-                moved.any(axis=0), limits.u_max - limits.u_min, 0.0
-            )
-            if not (np.isfinite(reach) & (reach > 0)).all():
-                raise MampcError("noise: expected standard deviations, since inputs without limits tell none")
-            return cls(model, noise=NOISE_OF_REACH * reach, guessed=True)
-        return cls(model, noise=noise)
+        if noise is None and white_noise(problem.model.noise) is None:
+            return cls(problem.model, noise=guessed_noise(problem), guessed=True)
+        return cls(problem.model, noise=noise)
 
     def __repr__(self) -> str:
         words = " ".join(h.load.value for h in self.hypotheses)
@@ -384,6 +375,22 @@ class LoadBank(Estimator):
         model = self.model
         change: Array = np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op
         return change
+
+
+def guessed_noise(problem: TrackingProblem) -> Array:
+    """A 500th of what the whole range of the inputs does to each output within 20 samples, dead times aside, (l,).
+
+    Raises:
+        MampcError: inputs without limits, or an output that none of them moves.
+    """
+    limits, response = problem.limits, np.abs(response_within_reach(problem.model))
+    width = np.where(response.any(axis=0), limits.u_max - limits.u_min, 0.0)
+    reach: Array = response @ np.where(np.isfinite(width), width, np.nan)
+    if not (np.isfinite(reach) & (reach > 0)).all():
+        raise MampcError(
+            "noise: expected standard deviations, since inputs without limits, or outputs that none moves, tell none"
+        )
+    return NOISE_OF_REACH * reach
 
 
 def _diagonal(blocks: Array) -> Array:

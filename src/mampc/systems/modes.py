@@ -28,3 +28,11 @@ def apart(A: Array, chosen: Callable[[complex], bool]) -> tuple[Array, Array, in
     if 0 < count < n:
         T[first, rest] = solve_sylvester(S[first, first], -S[rest, rest], -S[first, rest])
     return blocks, Q @ T, count
+
+
+def balanced(A: Array, discrete: bool) -> tuple[Array, Array]:
+    """I - A, or -A in continuous time, in units of the states that make its numbers alike; and these, shape (n,)."""
+    from scipy.linalg import matrix_balance
+
+    alike, (sizes, _) = matrix_balance(A, permute=False, separate=True)
+    return np.eye(len(A)) * discrete - alike, sizes

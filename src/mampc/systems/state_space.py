@@ -29,6 +29,7 @@ from mampc.base.checks import (
 from mampc.base.errors import MampcError, listed
 from mampc.base.names import Names, require_count
 from mampc.systems.evidence import Evidence
+from mampc.systems.modes import balanced
 from mampc.systems.noise import Noise
 
 if TYPE_CHECKING:
@@ -99,14 +100,13 @@ class StateSpace:
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
-        names = self.names
-        parts = [
-            f"{self.n_states} states",
-            f"inputs {_short(names.inputs)}",
-            f"outputs {_short(names.outputs)}",
-        ]
-        if names.disturbances:
-            parts.append(f"measured disturbances {_short(names.disturbances)}")
+        parts, names = [f"{self.n_states} states"], self.names
+        kinds = (
+            ("inputs", names.inputs),
+            ("outputs", names.outputs),
+            ("measured disturbances", names.disturbances),
+        )
+        parts += [f"{kind} {_short(own)}" for kind, own in kinds if own]
         parts.append(f"dt = {self.dt:g} s" if self.is_discrete else "continuous")
         return f"StateSpace({', '.join(parts)})"
 
@@ -165,7 +165,7 @@ class StateSpace:
         """
         if not self.n_states:
             return self.D
-        singular, sizes = self._balanced()
+        singular, sizes = balanced(self.A, self.is_discrete)
         if np.linalg.cond(singular) > 1e13:
             raise MampcError(
                 "dc_gain: expected a model without integrators, received a pole at zero frequency"
@@ -248,16 +248,9 @@ class StateSpace:
         change = as_vector("u", inputs, self.B.shape[1]) - self.all_inputs_op
         if not self.n_states or not change.any():
             return np.zeros(self.n_states)
-        singular, sizes = self._balanced()
+        singular, sizes = balanced(self.A, self.is_discrete)
         x: Array = sizes * np.linalg.lstsq(singular, self.B @ change / sizes)[0]
         return x
-
-    def _balanced(self) -> tuple[Array, Array]:
-        """I - A, or -A in continuous time, in units of the states that make its numbers alike; and these, (n,)."""
-        from scipy.linalg import matrix_balance
-
-        A, (sizes, _) = matrix_balance(self.A, permute=False, separate=True)
-        return np.eye(self.n_states) * self.is_discrete - A, sizes
 
     def response(self, u: Any, x0: Any = None) -> Array:
         """Outputs, shape (N, l), to the inputs u, shape (N, m + d), from the state x0 (default: at rest).
