@@ -69,6 +69,22 @@ def test_a_level_that_first_answers_the_wrong_way_gets_a_stable_loop():
     assert abs(run.y[-1] - run.r[-1]) < 0.01 * np.abs(plan.changes).max()
 
 
+def test_the_usual_price_costs_little_error_though_the_model_is_fast_and_slow():
+    poles = np.exp([-1.0, -0.01])
+    model = StateSpace(np.diag(poles), (1 - poles)[:, None], [[0.5, 0.5]], None, 1.0)
+    plan = draft(model, properties(model))
+    reference = np.repeat([plan.changes[0], [0.0]], 200, axis=0)
+    mpc, usual = (
+        mampc.simulate(model, mampc.Regulator(controller), reference, steps=400).metrics()
+        for controller in (
+            mampc.MPC(plan.problem),
+            mampc.MAMPC(plan.problem, mampc.MoveRules(price=plan.usual)),
+        )
+    )
+    assert usual.tracking_error < 1.3 * mpc.tracking_error
+    assert np.sum(usual.moves) < 0.1 * np.sum(mpc.moves)
+
+
 @pytest.mark.parametrize("units", [1e-8, 1e-3, 1e6])
 def test_units_decide_nothing(units, tmp_path):
     model = MODELS["delayed"]

@@ -122,6 +122,26 @@ def test_each_row_is_on_disk_before_the_decision_comes_back(tmp_path):
     assert recorder.step(state, model.y_op, model.y_op).u.shape == (2,)
 
 
+def test_a_row_that_was_cut_off_is_left_out(tmp_path):
+    model = with_disturbance(0)
+    regulator = everything(model)
+    with mampc.Recorder(tmp_path / "loop.csv", regulator) as recorder:
+        state = regulator.initial_state()
+        for _ in range(3):
+            state = recorder.step(state, model.y_op, model.y_op).state
+    content = (tmp_path / "loop.csv").read_bytes()
+    (tmp_path / "loop.csv").write_bytes(content[:-9])
+    recording = mampc.Recording.from_csv(tmp_path / "loop.csv", model.names)
+    assert len(recording.t) == 2
+    assert mampc.replay(regulator, None, recording, tolerance=0.0) is None
+
+
+def test_limits_of_another_type_are_refused():
+    regulator = everything(with_disturbance(0))
+    with pytest.raises(mampc.MampcError, match="limits: expected a mampc.Limits"):
+        regulator.step(regulator.initial_state(), [0.0, 0.0], [0.0, 0.0], limits=5)
+
+
 def test_a_loop_goes_on_where_the_disk_fails(tmp_path):
     model = random_model(3)
     regulator = mampc.Regulator(mampc.MPC(problem_of(model)))

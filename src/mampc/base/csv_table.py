@@ -22,13 +22,19 @@ class CSVTable:
 
     The file is kept as it is and parsed anew for every column, so that memory stays near the size of the file.
 
+    Args:
+        path: of the file.
+        whole: leave out a last row without an end, as a writer leaves it that is stopped.
+
     Raises:
         MampcError: a file that cannot be read, is beyond `CSV_FILE_LIMIT`, empty, ragged or not separated by commas.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, whole: bool = False) -> None:
         self.path = Path(path)
         self._content = read_bounded(path, CSV_FILE_LIMIT, "CSV file")
+        if whole:
+            self._content = self._content[: self._content.rfind(b"\n") + 1]
         count = 0
         try:
             for count, (number, row) in enumerate(self._rows(), 1):

@@ -88,12 +88,12 @@ class Recording:
 
     @classmethod
     def from_csv(cls, path: str | Path, names: Names) -> Recording:
-        """Read what `Run.to_csv` or a `Recorder` wrote of a plant with these names.
+        """Read what `Run.to_csv` or a `Recorder` wrote of a plant with these names, up to its last whole row.
 
         Raises:
             MampcError: anything else.
         """
-        table = CSVTable(path)
+        table = CSVTable(path, whole=True)
         live = read_live(table, names)
 
         def columns(words: list[str], *, finite: bool = True) -> Array:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import LARGEST, Array, BoolArray, as_read
+from mampc.base.checks import LARGEST, Array, BoolArray, as_instance, as_read
 from mampc.base.errors import MampcError
 from mampc.program.condensing import CondensedQP
 from mampc.program.levels import InputLevels
@@ -137,6 +137,7 @@ class LimitsNow:
     """
 
     def __init__(self, limits: Limits, condensed: CondensedQP, levels: InputLevels | None = None) -> None:
+        as_instance("limits", limits, Limits)
         problem, usual = condensed.problem, condensed.problem.limits
         n_c, n_p = problem.control_horizon, problem.prediction_horizon
         known = _known(condensed)

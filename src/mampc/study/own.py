@@ -15,7 +15,13 @@ import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError, listed
+from mampc.controllers import MAMPC, MPC
+from mampc.controllers.controller import Controller
 from mampc.controllers.offset import HIGHEST_PRICE, highest_price
+from mampc.loop.kalman_filter import KalmanFilter
+from mampc.loop.regulator import Regulator
+from mampc.loop.simulation import simulate
+from mampc.moves.rules import MoveRules
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import MOST_PREDICTIONS, Limits, TrackingProblem
 from mampc.systems.properties import Properties, properties, samples_to_grow, time_in_words
@@ -26,7 +32,10 @@ SHORTEST_HORIZON = 10
 ASKED = 0.3  # of what inputs can hold: the change of reference
 GUESSED_NOISE = 0.02  # of that change, where no record told
 MOST_CHANGES = 4  # of single outputs
-USUAL = 1 / 4  # of the highest price: it costs next to no error
+USUAL = 1 / 4  # of the highest price: most often it costs next to no error
+CHEAPER, PRICES = 4.0, 5  # how much lower the next price is that is tried, and how many are
+LITTLE = 1.25  # times the error of plain MPC
+TRIED = 12  # planned moves, up to which prices are tried in a moment
 DEAD_BAND = 0.01  # of the inputs' range
 LARGEST_WEIGHT = 1e9
 EFFORT = 0.1  # of the error that an input's change makes, in one sample: what its move costs
@@ -39,6 +48,7 @@ class Draft(NamedTuple):
     changes: Array
     every: int
     price: float
+    usual: float
     noise: Array
     known_limits: bool
     known_noise: bool
@@ -92,8 +102,29 @@ def draft(model: StateSpace, found: Properties) -> Draft:
     known_noise = model.noise is not None and bool((model.noise.output > 0).any())
     noise = model.noise.output if known_noise and model.noise is not None else GUESSED_NOISE * asked
     every = min(max(int(1.5 * settling) + dead, 20), 2 * LONGEST_HORIZON)
-    return Draft(
-        problem, changes, every, highest_price(problem, changes), _rounded(noise), known, known_noise
+    highest = highest_price(problem, changes)
+    usual = _usual_price(problem, np.vstack([changes, np.zeros(l)]), every, highest)
+    return Draft(problem, changes, every, highest, usual, _rounded(noise), known, known_noise)
+
+
+def _usual_price(problem: TrackingProblem, changes: Array, every: int, highest: float) -> float:
+    """The highest of some prices with which the changes, without noise, come out nearly as with plain MPC.
+
+    What a price costs after a change is foreseen by `highest_price`; not how far outputs may go astray while they
+    still move, which is much beside the error of plain MPC where some modes are fast and others slow.
+    """
+    model, prices = problem.model, [highest * USUAL / CHEAPER**k for k in range(PRICES)]
+    if problem.control_horizon * model.n_inputs > TRIED:
+        return prices[0]
+    reference, estimator = model.y_op + np.repeat(changes, every, axis=0), KalmanFilter.offset_free(model)
+
+    def error(controller: Controller) -> float:
+        run = simulate(model, Regulator(controller, estimator), reference, progress=False)
+        return float(np.einsum("ti,ij,tj->", run.y - run.r, problem.output_weight, run.y - run.r))
+
+    most = LITTLE * error(MPC(problem))
+    return next(
+        (price for price in prices if error(MAMPC(problem, MoveRules(price=price))) <= most), prices[-1]
     )
 
 
@@ -206,6 +237,7 @@ def _text(model: StateSpace, found: Properties, plan: Draft, file: str, name: st
         else "PLACEHOLDERS about the operating point: put in those of the plant"
     )
     noise_note = "as found in the record" if plan.known_noise else "a PLACEHOLDER: what the sensors have"
+    pays = plan.price / plan.usual / HIGHEST_PRICE
     return f"""# A mampc study of the model {_words([file])}, in engineering units. Run it with `mampc run THIS-FILE`;
 # `mampc new other.toml` writes a study in which every key is explained.
 #
@@ -253,13 +285,13 @@ seed = 0
 name = "MPC"
 method = "mpc"
 
-# A move must save this much; changes of the reference save {round(1 / USUAL / HIGHEST_PRICE)} times as much for each
+# A move must save this much; changes of the reference save {pays:.0f} times as much for each
 # input, or more.
 # `mampc tune THIS-FILE --max-error-increase 25%` finds the price for the error that you allow.
 [[controllers]]
 name = "price"
 method = "exact"
-rules = {{ price = {_number(float(f"{USUAL * plan.price:.2g}"))} }}
+rules = {{ price = {_number(float(f"{plan.usual:.2g}"))} }}
 
 # Fewer moves for more error; smaller changes are not followed.
 [[controllers]]

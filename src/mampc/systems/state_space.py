@@ -100,13 +100,10 @@ class StateSpace:
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
-        parts, names = [f"{self.n_states} states"], self.names
-        kinds = (
-            ("inputs", names.inputs),
-            ("outputs", names.outputs),
-            ("measured disturbances", names.disturbances),
-        )
-        parts += [f"{kind} {_short(own)}" for kind, own in kinds if own]
+        names = self.names
+        signals = names.inputs, names.outputs, names.disturbances
+        kinds = zip(("inputs", "outputs", "measured disturbances"), signals, strict=True)
+        parts = [f"{self.n_states} states", *(f"{kind} {_short(own)}" for kind, own in kinds if own)]
         parts.append(f"dt = {self.dt:g} s" if self.is_discrete else "continuous")
         return f"StateSpace({', '.join(parts)})"
 
