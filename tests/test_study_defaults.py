@@ -17,7 +17,7 @@ from mampc.study.schema import (
     SensorsTable,
 )
 
-ELSEWHERE = {"disturbance_at", "name", "rules", "method", "settings", "published", "limits"}
+ELSEWHERE = {"disturbance_at", "name", "rules", "method", "settings", "published", "limits", "manual"}
 # A study samples a plant without feedthrough; a record from elsewhere may have one.
 ELSEWHERE |= {"feedthrough"}
 PAIRS = [
