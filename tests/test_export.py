@@ -176,6 +176,22 @@ def test_remarks_that_begin_late_are_seen(tmp_path):
     assert [len(record) for record in export.records] == [90, 29]
 
 
+def test_rows_without_a_remark_are_not_lost_where_one_remark_is_a_good_one(tmp_path):
+    lines = [
+        [time, "5" if k % 9 else "6", str(0.5 * k), {80: "Good run", 90: "Bad"}.get(k, "")]
+        for k, time in enumerate(stamps(120))
+    ]
+    export = read(tmp_path, text(lines, header=("time", "u", "y", "remark")))
+    assert [len(record) for record in export.records] == [90, 29]
+
+
+@pytest.mark.parametrize("header", ["Good", "Valid"])
+def test_one_means_true_where_values_are_said_to_be_good(tmp_path, header):
+    lines = [[time, u, y, "0" if k == 5 else "1"] for k, (time, u, y) in enumerate(rows())]
+    export = read(tmp_path, text(lines, header=("time", "u", "y", header)))
+    assert [len(record) for record in export.records] == [5, 6]
+
+
 def test_the_measured_quality_of_a_product_says_nothing_of_others(tmp_path):
     lines = [[time, u, y, f"9{k % 3}.5"] for k, (time, u, y) in enumerate(rows())]
     assert_whole(read(tmp_path, text(lines, header=("time", "u", "y", "Quality"))))

@@ -138,7 +138,7 @@ def test_a_row_that_was_cut_off_is_left_out(tmp_path):
 
 def test_limits_of_another_type_are_refused():
     regulator = everything(with_disturbance(0))
-    with pytest.raises(mampc.MampcError, match="limits: expected a mampc.Limits"):
+    with pytest.raises(mampc.MampcError, match=r"limits: expected a mampc\.Limits"):
         regulator.step(regulator.initial_state(), [0.0, 0.0], [0.0, 0.0], limits=5)
 
 

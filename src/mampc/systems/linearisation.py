@@ -89,9 +89,9 @@ def _slope(function: Callable[[Array], Array], point: Array, i: int, step: float
     below[i] -= step
     with np.errstate(all="ignore"):
         try:
-            rise: Array = np.asarray(function(above) - function(below), dtype=float)
+            rise: Array = np.asarray(function(above), dtype=float) - np.asarray(function(below), dtype=float)
         except Exception:  # whatever a plant says of states that it does not have
-            return np.full_like(function(point), np.nan)
+            return np.full(np.shape(function(point)), np.nan)
         slope: Array = rise / (above[i] - below[i])
     return slope
 
@@ -103,5 +103,5 @@ def _rounding(function: Callable[[Array], Array], point: Array) -> Array:
     for i in range(len(point)):
         near = point.copy()
         near[i] *= 1 + 4 * np.finfo(float).eps
-        noise += np.abs(function(near) - values)
+        noise += np.abs(np.asarray(function(near), dtype=float) - values)
     return noise

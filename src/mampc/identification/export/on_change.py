@@ -82,7 +82,8 @@ def sampled(
         return clock, values, numbers
     if held.all():
         order = np.argsort(clock.seconds, kind="stable")
-        order = order[np.isfinite(clock.seconds[order]) & np.isfinite(values[order]).all(axis=1)]
+        order = order[np.isfinite(clock.seconds[order])]
+        order = order[np.cumsum(np.isfinite(values[order]).all(axis=1)) > 0]  # since all have a value
         if dt is None or not len(order):
             findings.doubt(
                 "expected a sample time (dt, --dt), as all columns hold their last value (on_change)"

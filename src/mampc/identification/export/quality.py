@@ -87,6 +87,13 @@ def _spoken_later(sheet: Sheet, free: Sequence[int]) -> set[int]:
     return {at for at in empty if words[at] and all(map(SPOKEN.fullmatch, words[at]))}
 
 
+def _is_remark(sheet: Sheet, at: int) -> bool:
+    """Whether it is by a few cells alone that a column speaks of others: where it is empty nothing is said."""
+    word = _plain(sheet.header[at])
+    named = word in (*WORDS, *TRUTHS, *DENIALS) or _speaks_of_any(sheet.header, at)
+    return not named and not any(row[at] for row in sheet.sample)
+
+
 def _is_general(sheet: Sheet, at: int) -> bool:
     word, cells = _plain(sheet.header[at]), [row[at].strip().casefold() for row in sheet.sample]
     if word in WORDS:
@@ -135,9 +142,12 @@ def drop_bad_quality(
     for at, names in speaking.items():
         words = _words(sheet.column(at))
         denies = DENIAL.search(sheet.header[at].casefold()) is not None
-        is_good = (
-            _not_true(words) if denies else _good(words, [str(word).strip().casefold() for word in good])
-        )
+        named = [str(word).strip().casefold() for word in good]
+        if _is_remark(sheet, at):
+            named.append("")
+        if _plain(sheet.header[at]) in TRUTHS:
+            named.append("1")
+        is_good = _not_true(words) if denies else _good(words, named)
         if is_good is None:
             kinds = ", ".join(f"{shown(word)} ({count})" for word, count in Counter(words).most_common(5))
             findings.doubt(
