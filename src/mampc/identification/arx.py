@@ -29,8 +29,10 @@ def estimate_arx(
 
     Args:
         delays: in samples, shape (l, m).
-        orders: one per output, if they are known.
+        orders: one per output, if they are known; that of a single output is also the order asked for.
     """
+    if orders is None and settings.order is not None and len(delays) == 1:
+        orders = (settings.order,)
     parts = []
     first = 0 if settings.feedthrough else 1
     for i, row in enumerate(delays):

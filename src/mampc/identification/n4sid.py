@@ -109,7 +109,8 @@ def n4sid(
     Args:
         data: a record, or several of the same plant, each with an initial state and constants of its own.
         order: n; by default the singular values say how many orders the record supports, and the one
-            is taken that explains it best by Schwarz's criterion, or a larger one whose error is 2 % less.
+            is taken that explains it best by Schwarz's criterion. Where disturbances are made white first, each of
+            several outputs has an order of its own, which the record says.
         weighting: "cva" (canonical variates: whitens the future outputs, best with noise), "n4sid" or
             "moesp" (unweighted; the same range in the projected form used here, which is SLICOT's).
         block_rows: s, how many samples past and future hold; default 15, less for short records, more
