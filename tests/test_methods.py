@@ -146,6 +146,14 @@ def test_least_sizes_take_a_bounded_number_of_programs(name, monkeypatch):
     assert len(solved) < 1.1 * MOST_PROGRAMS
 
 
+@every_heuristic
+def test_beyond_its_time_a_method_keeps_the_best_plan_so_far(name, monkeypatch):
+    monkeypatch.setattr("mampc.methods.heuristic.SECONDS", 0.0)
+    problem, past, x, reference = sample(5, control_horizon=10)
+    controller = controller_of(problem, MoveRules(min_size=0.4, price=1e-4), name)
+    assert not decide(controller, past, x, reference).held
+
+
 @every_method
 def test_a_step_is_pure_and_its_state_can_be_pickled(name):
     problem = tank_problem()

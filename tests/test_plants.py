@@ -241,3 +241,30 @@ def test_units_of_states_do_not_decide_how_exactly_a_plant_is_integrated(unit):
         courses.append(excite(one, inputs, dt=0.7).y)
     assert np.ptp(courses[0]) > 0.5
     np.testing.assert_allclose(courses[1], courses[0], rtol=1e-8)
+
+
+class Deviation:
+    """A lag and what its square drives, both at rest at zero, with states and output of a unit of their own."""
+
+    names, u_op = Names(("u",), ("y",), ("fast", "slow")), np.array([1.0])
+
+    def __init__(self, unit):
+        self.unit = unit
+
+    def derivative(self, x, u):
+        a, b = x[..., 0] / self.unit, x[..., 1] / self.unit
+        return self.unit * np.stack([np.asarray(u)[..., 0] - 1 - a, a + a * a - 50 * b], -1)
+
+    def output(self, x, u):
+        return x[..., 1:] / self.unit
+
+    def steady_state(self, u=None):
+        a = 0.0 if u is None else float(np.ravel(u)[0]) - 1.0
+        return self.unit * np.array([a, (a + a * a) / 50])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e6])
+def test_states_at_rest_at_zero_are_integrated_alike_in_every_unit(unit):
+    signal = np.repeat([[0.0], [2.0]], 5, axis=0)
+    expected, found = (excite(Deviation(one), signal, dt=1.0).y for one in (1.0, unit))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from time import perf_counter
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,6 +28,7 @@ from mampc.program.qp import QPStatus
 from mampc.program.sample import Sample
 
 REFEREE_SECONDS = 1.0  # that a certificate may take, or the question whether there is any plan, per sample
+SECONDS = 1.0  # of a sample, after which no further pattern is tried
 MOST_PROGRAMS = 1000  # of one sample with least sizes, where only an exact method has to try all signs
 
 
@@ -105,12 +107,14 @@ class HeuristicSearch:
     ) -> Plan:
         """The best plan on the patterns proposed, as an answer; no moves at all is always among them."""
         best, solved, solver = Incumbent(MOST_PROGRAMS), None, self._solver.after(inputs)
+        deadline, ended = perf_counter() + SECONDS, Ended(0)
         try:
-            while True:
+            while solved is None or perf_counter() < deadline:
                 pattern = next(proposals) if solved is None else proposals.send(solved)
-                solved = solver.offer(sample, pattern, best)
+                solved = solver.offer(sample, pattern, best, deadline)
+            ended = Ended(best.solved)
         except StopIteration as end:
-            ended: Ended = end.value
+            ended = end.value
         best.offer(solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
         guess, remarks = self._shifted(ended.moves), self._remarks(allowance)
         if best.moves is not None:

@@ -42,14 +42,47 @@ SLOPE = 1e-7  # of a state's size: steps of the differences for its Jacobian
 
 
 def state_sizes(plant: Plant) -> Array | None:
-    """How large each state usually is, shape (n,): as in the plant's steady state, one where that is zero; None where
-    it tells none.
+    """How large each state usually is, shape (n,); None where the plant tells no steady state.
+
+    That is as in its steady state; of a state that is zero there, as far as inputs change it, and at most one.
     """
-    try:
-        sizes = np.abs(np.asarray(plant.steady_state(), dtype=float))
-    except Exception:  # whatever a plant without usual inputs does when it is asked for their steady state
+    rest = _at_rest(plant, None)
+    if rest is None:
         return None
-    return np.where(np.isfinite(sizes) & (sizes > ROUNDED), sizes, 1.0) if sizes.ndim == 1 else None
+    sizes = np.abs(rest)
+    zero = ~(np.isfinite(sizes) & (sizes > ROUNDED))
+    if zero.any():
+        sizes[zero] = 0.0
+        moved = _moved(plant, rest)[zero]
+        sizes[zero] = np.where((moved > 0) & (moved < 1.0), moved, 1.0)
+    return sizes
+
+
+def _moved(plant: Plant, rest: Array) -> Array:
+    """The largest changes of the steady states with each input changed by itself, shape (n,)."""
+    usual = getattr(plant, "u_op", None)
+    moved: Array = np.zeros(len(rest))
+    if usual is None:
+        return moved
+    inputs = np.concatenate([np.ravel(usual), np.ravel(getattr(plant, "v_op", ()))]).astype(float)
+    for i, value in enumerate(inputs):
+        changed = inputs.copy()
+        changed[i] += 0.1 * (abs(value) or 1.0)
+        there = _at_rest(plant, changed)
+        if there is not None and there.shape == rest.shape:
+            far = np.abs(there - rest)
+            certain = far > ROUNDED * np.maximum(np.abs(there), np.abs(rest))
+            moved = np.maximum(moved, np.where(np.isfinite(far) & certain, far, 0.0))
+    return moved
+
+
+def _at_rest(plant: Plant, inputs: Array | None) -> Array | None:
+    try:
+        state = plant.steady_state() if inputs is None else plant.steady_state(inputs)
+        found: Array = np.array(state, dtype=float)
+    except Exception:  # whatever a plant does when it is asked for a steady state that it does not have
+        return None
+    return found if found.ndim == 1 else None
 
 
 def advance(plant: Plant, x: Array, u: Array, dt: float, *, sizes: Array | None = None) -> Array:
