@@ -87,3 +87,9 @@ def test_a_channel_that_is_zero_takes_no_state():
     model = StateSpace.from_any(control.tf([[[0.0], [1.0]], [[1.0], [0.0]]], [[[1.0], [2.0, 1.0]]] * 2))
     assert model.n_states == 1 + 0
     np.testing.assert_allclose(model.D, [[0.0, 0.0], [1.0, 0.0]])
+
+
+@pytest.mark.parametrize("dt", ["fast", [1.0, 2.0], float("nan")])
+def test_a_sample_time_that_is_no_number_is_refused(dt):
+    with pytest.raises(mampc.MampcError, match="dt: expected a finite number"):
+        mampc.StateSpace.from_any(([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), dt=dt)

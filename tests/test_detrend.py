@@ -199,3 +199,27 @@ def test_stages_are_told():
     assert told[0] == "looking for dead times"
     assert "all of the record" in told[-1]
     assert any("ARX" in stage for stage in told)
+
+
+@pytest.mark.parametrize("samples", [2, 3, 9])
+def test_a_record_too_short_to_make_white_does_no_harm(samples):
+    rng, plant = (
+        np.random.default_rng(0),
+        StateSpace.from_first_order(gain=2.0, time_constant=5.0, dt=1.0),
+    )
+    records = []
+    for N in (200, samples):
+        u = np.repeat(rng.choice([-1.0, 1.0], (N // 5 + 1, 1)), 5, axis=0)[:N]
+        records.append(IOData(u, plant.response(u) + 0.02 * rng.standard_normal((N, 1)), 1.0))
+    model = n4sid(records, detrend="whitened").model
+    assert model.dc_gain()[0, 0] == pytest.approx(2.0, rel=0.05)
+
+
+def test_an_order_that_is_asked_for_is_kept_where_disturbances_are_made_white():
+    rng, plant = (
+        np.random.default_rng(0),
+        StateSpace.from_first_order(gain=2.0, time_constant=5.0, dt=1.0),
+    )
+    u = np.repeat(rng.choice([-1.0, 1.0], (100, 1)), 5, axis=0)
+    data = IOData(u, plant.response(u) + 0.1 * rng.standard_normal((500, 1)), 1.0)
+    assert n4sid(data, detrend="whitened", order=2).order == 2

@@ -22,11 +22,20 @@ LONGEST = 30  # coefficients of the filter
 ITERATIONS = 20
 SETTLED = 1e-6  # change of a coefficient
 EDGE = 1 - 1e-9  # largest pole
+SHORTEST = 8  # samples of a record, of which the filter takes a quarter
 EACH = 20  # samples for each coefficient of the ARX model, at least
 
 
 def prewhitened(records: Scaled, first: int) -> Scaled:
-    """Inputs and the one output through A(q) of a long ARX model."""
+    """Inputs and the one output through A(q) of a long ARX model; records too short for that are left out."""
+    long = [k for k, u in enumerate(records.u) if len(u) >= SHORTEST]
+    if 0 < len(long) < len(records.u):
+        records = replace(
+            records,
+            u=tuple(records.u[k] for k in long),
+            y=tuple(records.y[k] for k in long),
+            y_mean=tuple(records.y_mean[k] for k in long),
+        )
     m = records.u[0].shape[1]
     lags = max(2, min(LONGEST, records.samples // (EACH * (m + 1)), min(map(len, records.u)) // 4))
     a = denominator(records.u, records.y, lags, 0, first)

@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from mampc.base.checks import Array
+from mampc.base.checks import Array, as_number
 from mampc.base.errors import MampcError
 from mampc.systems.state_space import StateSpace
 
@@ -19,6 +19,7 @@ Matrices: TypeAlias = tuple[Array, Array, Array, Array]
 
 def model_of(system: Any, dt: float | None) -> StateSpace:
     """A model at the sample time wanted, if any; see `StateSpace.from_any`."""
+    dt = None if dt is None else as_number("dt", dt, 0.0)
     if isinstance(system, StateSpace):
         model = system
     else:
