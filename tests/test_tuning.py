@@ -305,6 +305,7 @@ def test_a_study_is_compared_with_its_own_mpc(folder):
         (["small.toml", "--max-error-increase", "5%", "--max-moves-per-hour", "3"], "one of"),
         (["model.json"], "--u-min and --u-max"),
         (["model.json", "--u-min", "low", "--u-max", "1"], "--u-min: expected numbers"),
+        (["model.json", "--u-min", "0", "--u-max", "100%"], "--u-max: expected numbers in"),
         (["small.toml", "--u-min", "0"], "a study has limits"),
         (["none.json", "--u-min", "0", "--u-max", "1"], "none.json"),
         (["none.toml"], "TOML"),

@@ -24,7 +24,7 @@ def row(name: str, text: str | None) -> float | list[float] | None:
     """One number, or several between commas."""
     if text is None:
         return None
-    numbers = [number(name, cell) for cell in text.split(",")]
+    numbers = [_quantity(name, cell) for cell in text.split(",")]
     return numbers[0] if len(numbers) == 1 else numbers
 
 
@@ -32,7 +32,16 @@ def matrix(name: str, text: str | None) -> float | list[list[float]] | None:
     """One number, or rows between semicolons."""
     if text is None:
         return None
-    rows = [[number(name, cell) for cell in line.split(",")] for line in text.split(";")]
+    rows = [[_quantity(name, cell) for cell in line.split(",")] for line in text.split(";")]
     if len({len(line) for line in rows}) > 1:
         raise MampcError(f"{name}: expected rows of one length, received {shown(text)}")
     return rows[0][0] if len(rows) == len(rows[0]) == 1 else rows
+
+
+def _quantity(name: str, text: str) -> float:
+    """A number in engineering units: 50% of a valve is 50 there, and no half."""
+    if "%" in text:
+        raise MampcError(
+            f"{name}: expected numbers in the signal's own unit, such as 2.5, received {shown(text)}"
+        )
+    return number(name, text)
