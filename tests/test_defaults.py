@@ -124,6 +124,39 @@ def test_with_longer_delays_missing_the_bank_does_better_than_the_filter(delay):
     assert cost[0] < 0.5 * cost[1]
 
 
+INVERSE = mampc.StateSpace(  # first the wrong way
+    [[0.78, 0.0], [0.2, 0.9]], [[0.2], [0.0]], [[-1.0, 1.5]], None, 1.0
+)
+DIRECT = mampc.StateSpace(
+    [[0.9, 0.1], [0.0, 0.7]],
+    [[0.1, 0.0], [0.05, 0.2]],
+    [[1.0, 0.0], [0.3, 1.0]],
+    [[0.3, 0.0], [0.1, 0.4]],
+    1.0,
+)
+TALL = mampc.StateSpace.from_first_order(
+    gain=[[1.0], [0.5], [2.0]], time_constant=[[3.0], [6.0], [2.0]], dt=1.0
+)
+
+
+@pytest.mark.parametrize(
+    "model", [INVERSE, DIRECT, TALL], ids=["inverse response", "feedthrough", "more outputs"]
+)
+def test_with_twice_the_gain_of_the_model_a_loop_with_the_bank_does_not_swing_from_limit_to_limit(model):
+    plant = replace(model, B=2 * model.B, D=2 * model.D)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=30, control_horizon=3, move_weight=0.05, tail_horizon=10.0,
+        limits=mampc.Limits(u_min=-10.0, u_max=10.0),
+    )  # fmt: skip
+    reference = mampc.steps(200, np.zeros(model.n_outputs), [(10, 3 * model.dc_gain().sum(axis=1))])
+    error = []
+    for estimator in (LoadBank(model, noise=0.1), KalmanFilter.offset_free(model, measurement_noise=0.1)):
+        regulator = mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator)
+        batch = mampc.simulate_batch(plant, regulator, reference, noise=0.1, seeds=range(2), progress=False)
+        error.append(np.square(batch.y - reference).mean())
+    assert error[0] < 2.5 * error[1]
+
+
 DOUBLE = mampc.StateSpace([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]], None, 1.0)
 UNSTABLE = mampc.StateSpace([[1.08, 0.2], [0.0, 0.7]], [[0.05], [0.3]], [[1.0, 0.0]], None, 1.0)
 LEVEL = mampc.StateSpace([[1.0, 0.3], [0.0, 0.7]], [[0.05], [0.3]], [[1.0, 0.0]], None, 1.0)

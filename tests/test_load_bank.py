@@ -12,7 +12,7 @@ from load_bank_models import MODELS, bank_of
 from mampc import LoadBank, LoadKind
 from mampc.loop.disturbances import state_sizes
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
-from mampc.loop.load_bank import FORGIVEN, LATE
+from mampc.loop.load_bank import DOUBTED, FORGIVEN, LATE
 from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.riccati import predicted_covariance, seen_covariance
 
@@ -79,22 +79,22 @@ def naive(bank, estimate, drive, surplus, h):
                 T[a, b] = STAYS
             else:
                 T[a, b] = TO_JUMP if jumps[b] else (1 - STAYS - TO_JUMP) / (B - 2)
-    c, predicted, innovation = mu @ T, [], surplus.copy()
+    c, predicted = mu @ T, []
     variance, seen = estimate.scale
     n = len(drive)
     for b, member in enumerate(bank.members):
         z = sum(mu[a] * T[a, b] * estimate.members[a] for a in range(B)) / c[b]
         predicted.append(member.A @ z)
         predicted[-1][:n] += drive
-        innovation -= c[b] * member.C @ predicted[-1]
     members, likelihood, surprise = [], [], []
     for z, member in zip(predicted, bank.members, strict=True):
         e = surplus - member.C @ z
         S = member.C @ member.covariance @ member.C.T + member.noise
-        moved = sum(h[i] ** 2 * np.linalg.inv(S)[i, i] for i in range(len(e)) if h[i] * innovation[i] < 0)
+        moved = sum(h[i] ** 2 * np.linalg.inv(S)[i, i] for i in range(len(e)))
         trust = max(
             1 / (1 + moved / len(e) / min(variance, 1.0)),
             1 - FORGIVEN * np.sqrt(moved / (e @ np.linalg.solve(S, e))),
+            1 / DOUBTED,
         )
         doubted = 1 / trust
         members.append(z + member.covariance @ member.C.T @ np.linalg.solve(S, e) / doubted)

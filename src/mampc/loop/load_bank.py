@@ -9,11 +9,11 @@ mixture of all that may have led to them:
 with the innovation e_b of filter b and its covariance S_b. These hold up to one factor, which the innovations of late
 tell: loads are told in units of the noise, so noise that was told wrongly changes no gain.
 
-A plant may do what inputs ask for later, or less of it, than its model says. While outputs lag behind what the inputs'
-moves of the last samples did, h, their innovations vary by 1 + h' diag(S_b^-1) h / l times as much, h of the outputs
-that lag alone, and what is corrected falls by as much. Three standard deviations are forgiven at most: what no delay
-explains is corrected in full; loads, and what goes on by itself, are followed at once. The factor of the noise counts
-up to one here: errors of the model, which make it larger, are no reason for less caution.
+A plant may do what inputs ask for later, or more or less of it, than its model says. By what the inputs' moves of the
+last samples did to the outputs, h, their innovations may be off: these vary by 1 + h' diag(S_b^-1) h / l times as much,
+and what is corrected falls by as much, to a tenth at least. Three standard deviations are forgiven: what no such
+error explains is corrected; loads, and what goes on by itself, are followed at once. The factor of the noise counts up
+to one here: errors of the model, which make it larger, are no reason for less caution.
 
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
@@ -39,8 +39,9 @@ from mampc.systems.state_space import StateSpace, as_discrete
 NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
 NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
-LATE = 5.0  # samples since when a plant may lag behind its model, of those that count less and less
+LATE = 5.0  # samples since when inputs' moves make a model doubtful, of those that count less and less
 FORGIVEN = 3.0  # standard deviations of that
+DOUBTED = 10.0  # times as much as otherwise innovations vary at most
 SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
@@ -106,7 +107,7 @@ class LoadBank(Estimator):
         self._filters: dict[bytes, Filters] = {}
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
-        self._of_late, self._lagging = self._moves(), slice(model.n_states, model.n_states + l)
+        self._of_late, self._moved = self._moves(), slice(model.n_states, model.n_states + l)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         self._of_states, self._of_known = self._everyday()
         size = self._of_known.shape[0] * self._of_states.shape[0] * self._of_states.shape[2]
@@ -217,7 +218,7 @@ class LoadBank(Estimator):
         each = each.reshape(len(c), -1)
         seen = c.dot(each[:, 2 * n_z : -l])  # innovation and movement of the mixture
         late = self._of_late.dot(np.concatenate((bank.late, u)))
-        estimate = self._weighed(*self._split(each), seen[:l], late, c, bank, self._everything)
+        estimate = self._weighed(*self._split(each), late, c, bank, self._everything)
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
@@ -231,7 +232,7 @@ class LoadBank(Estimator):
             each += (known @ self._of_known.T).reshape(len(y), hypotheses, -1)
             seen = np.einsum("sb,sbi->si", c, each[:, :, 2 * n_z : -l])
             late = np.concatenate((bank.late, u), axis=1) @ self._of_late.T
-            estimate = self._weighed(*self._split(each), seen[:, :l], late, c, bank, self._everything)
+            estimate = self._weighed(*self._split(each), late, c, bank, self._everything)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
     def _split(self, each: Array) -> tuple[Array, Array, Array]:
@@ -287,9 +288,7 @@ class LoadBank(Estimator):
         each = innovation + bank.weights @ seen - seen
         correction = np.matmul(filters.gains, each[:, :, None])[:, :, 0]
         white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
-        return self._weighed(
-            bank.members, correction, white, innovation, bank.late, bank.weights, bank, filters
-        )
+        return self._weighed(bank.members, correction, white, bank.late, bank.weights, bank, filters)
 
     def filters(self, believed: BoolArray) -> Filters:
         """The gains where only some outputs, bool (l,), are believed."""
@@ -313,7 +312,6 @@ class LoadBank(Estimator):
         members: Array,
         correction: Array,
         white: Array,
-        seen: Array,
         late: Array,
         c: Array,
         bank: BankEstimate,
@@ -324,19 +322,18 @@ class LoadBank(Estimator):
         Args:
             members, correction: predicted, and what innovations alone would add to them, shape (..., B, n + 2k).
             white: innovations made white, shape (..., B, l).
-            seen: innovation of the mixture, shape (..., l).
             late: of the estimate, as predicted.
             c: how likely each hypothesis was before, shape (..., B).
         """
-        believed, h = max(filters.believed, 1), late[..., self._lagging]
-        lag = h * (h * seen < 0)
+        believed, h = max(filters.believed, 1), np.square(late[..., self._moved])
         surprise = np.square(white).dot(self._per_output)
-        moved = filters.precisions.dot(lag * lag) if lag.ndim == 1 else (lag * lag) @ filters.precisions.T
+        moved = filters.precisions.dot(h) if h.ndim == 1 else h @ filters.precisions.T
         forgiven = FORGIVEN * np.sqrt(moved / np.maximum(surprise, IMPOSSIBLE))
         trust = np.maximum(1 / (1 + moved / (believed * np.minimum(bank.scale[..., :1], 1.0))), 1 - forgiven)
+        trust = np.maximum(trust, 1 / DOUBTED)
         surprise *= trust
         log_scale = filters.log_scale + 0.5 * filters.believed * np.log(trust)
-        after = self._mixing.one if seen.ndim == 1 else self._mixing.many
+        after = self._mixing.one if late.ndim == 1 else self._mixing.many
         return self._estimate(
             members + trust[..., None] * correction,
             *after(c, surprise, log_scale, filters.believed, bank.usual, bank.scale),
