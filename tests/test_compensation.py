@@ -8,6 +8,7 @@ import pytest
 import mampc
 from builders import same_decision, tank_model, tank_problem
 from mampc.study import parse_study, run_study
+from mampc.study.regulators import regulator_of
 from referees import moved
 from seeds import examples
 
@@ -227,3 +228,11 @@ def test_a_study_compensates_the_valves_of_a_bank(tmp_path):
     )
     with pytest.raises(mampc.StudyError, match="'calm': compensate: expected rules"):
         run_study(parse_study(text, folder=tmp_path))
+
+
+def test_a_compensated_controller_keeps_the_price_that_a_sweep_gives_it(tmp_path):
+    alone = BANK[: BANK.index('[[controllers]]\nname = "both"')]
+    study = parse_study(alone.replace("switches", "# switches") + "compensate = true\n", folder=tmp_path)
+    brisk = study.controllers[-1]
+    priced = brisk.model_copy(update={"rules": brisk.rules.model_copy(update={"price": 7.0})})
+    assert regulator_of(study, MODEL, priced).controller.rules.price == 7.0

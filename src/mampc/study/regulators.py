@@ -29,7 +29,8 @@ EXECUTED = 1.05  # of what a valve does not answer: the least move, since nobody
 def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Regulator:
     """The regulator that a study's tables describe."""
     problem = problem_of(study, model)
-    valves, tables = None, study.controllers
+    valves = None
+    tables = [table if other.name == table.name else other for other in study.controllers]  # at another price
     if table.compensate and study.actuators is not None:
         valves = study.actuators.valves()
         names = table.variants or [table.name]
