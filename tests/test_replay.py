@@ -160,7 +160,7 @@ def test_every_trajectory_of_a_study_replays_from_the_command_line(tmp_path, few
     assert CliRunner().invoke(app, ["replay", str(path), "-s", str(study)]).exit_code == 0
     lines = path.read_text().splitlines()
     lines[12] = lines[12].replace(",optimal,", ",held_infeasible,")
-    path.write_text("\n".join(lines))
+    path.write_text("\n".join(lines) + "\n")
     outcome = CliRunner().invoke(app, ["replay", str(path), "-s", str(study)])
     assert outcome.exit_code == 1
     assert "sample 11" in outcome.output.replace("\n", " ")
