@@ -385,7 +385,8 @@ def guessed_noise(problem: TrackingProblem) -> Array:
     reach: Array = response @ np.where(np.isfinite(width), width, np.nan)
     if not (np.isfinite(reach) & (reach > 0)).all():
         raise MampcError(
-            "noise: expected standard deviations, since inputs without limits, or outputs that none moves, tell none"
+            "noise: expected standard deviations, or u_min and u_max of all inputs to guess them from, received "
+            "neither, or an output that no input moves"
         )
     return NOISE_OF_REACH * reach
 
