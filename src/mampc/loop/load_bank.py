@@ -385,8 +385,8 @@ def guessed_noise(problem: TrackingProblem) -> Array:
     reach: Array = response @ np.where(np.isfinite(width), width, np.nan)
     if not (np.isfinite(reach) & (reach > 0)).all():
         raise MampcError(
-            "noise: expected standard deviations, or u_min and u_max of all inputs to guess them from, received "
-            "neither, or an output that no input moves"
+            "noise: expected standard deviations, or u_min and u_max of all inputs to guess them from, received inputs "
+            "without limits, or an output that none moves"
         )
     return NOISE_OF_REACH * reach
 
