@@ -16,7 +16,7 @@ from mampc.base.checks import Array, as_vector
 from mampc.base.errors import MampcError
 from mampc.loop.batch import simulate_batch
 from mampc.loop.disturbances import input_units, response_within_reach
-from mampc.loop.load_bank import guessed_noise
+from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.loads import Coloured, Load, RandomSteps, RandomWalk, drawn
 from mampc.loop.regulator import Regulator
 from mampc.program.problem import Limits, TrackingProblem

@@ -28,8 +28,8 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
-from mampc.loop.disturbances import response_within_reach
 from mampc.loop.estimator import Estimate, Estimator, Updated
+from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.hypotheses import HYPOTHESES, RUNS_AWAY, Hypothesis, Loads, Member
 from mampc.loop.mixing import IMPOSSIBLE, BankEstimate, Filters, Mixing
 from mampc.program.problem import TrackingProblem
@@ -37,7 +37,6 @@ from mampc.systems.noise import white_noise
 from mampc.systems.state_space import StateSpace, as_discrete
 
 NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
-NOISE_OF_REACH = 0.002  # of what the inputs' whole range does to an output: noise that nobody told of
 
 LATE = 5.0  # samples since when inputs' moves make a model doubtful, of those that count less and less
 FORGIVEN = 3.0  # standard deviations of that
@@ -372,23 +371,6 @@ class LoadBank(Estimator):
         model = self.model
         change: Array = np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op
         return change
-
-
-def guessed_noise(problem: TrackingProblem) -> Array:
-    """A 500th of what the whole range of the inputs does to each output within 20 samples, dead times aside, (l,).
-
-    Raises:
-        MampcError: inputs without limits, or an output that none of them moves.
-    """
-    limits, response = problem.limits, np.abs(response_within_reach(problem.model))
-    width = np.where(response.any(axis=0), limits.u_max - limits.u_min, 0.0)
-    reach: Array = response @ np.where(np.isfinite(width), width, np.nan)
-    if not (np.isfinite(reach) & (reach > 0)).all():
-        raise MampcError(
-            "noise: expected standard deviations, or u_min and u_max of all inputs to guess them from, received inputs "
-            "without limits, or an output that none moves"
-        )
-    return NOISE_OF_REACH * reach
 
 
 def _diagonal(blocks: Array) -> Array:
