@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import mampc
 
 MOST = 3  # inputs and outputs
+LARGEST = 1e12  # beyond it no number is believed
 SPARSE = {
     "exact": {"time_limit": 0.1},
     "alternating": {"polish": True, "warm_up": 0},
@@ -24,6 +25,13 @@ EXTREMES = (
     np.nan, np.inf, -np.inf, 1e308, -1.7e308, 1e300, 1e12, -1e12, 9.9e11, -9.9e11, 4e11, 1e9, -1e6, 5e-324, -0.0
 )  # fmt: skip
 NUMBERS = st.one_of(st.sampled_from(EXTREMES), st.floats(), st.floats(-1e3, 1e3), st.floats(-3.0, 3.0))
+
+
+def same_to_the_bit(a, b):
+    return a.status is b.status and all(
+        np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+        for name in ("u", "plan", "changes", "objective", "lower_bound", "violations")
+    )
 
 
 @dataclass(frozen=True)
