@@ -216,8 +216,14 @@ def test_numbers_of_very_many_digits_are_refused(option, number):
     refuses(tank_problem, **{option: number})
 
 
-def test_importing_mampc_leaves_heavy_modules_out():
-    heavy = ["scipy", "matplotlib", "pandas", "plotly", "typer"]
+def test_importing_mampc_leaves_out_heavy_modules_and_what_no_loop_needs():
+    heavy = ["scipy", "matplotlib", "pandas", "plotly", "typer", "mampc.identification", "mampc.compare"]
     code = f"import sys, mampc; print([name for name in {heavy} if name in sys.modules])"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
+
+
+def test_every_public_name_is_there_and_no_other():
+    assert [name for name in mampc.__all__ if not hasattr(mampc, name)] == []
+    assert set(mampc.__all__) <= set(dir(mampc))
+    assert not hasattr(mampc, "MCP")

@@ -3,37 +3,23 @@
 See README.md for ten lines that run, docs/ for the rest.
 """
 
-from mampc import plants, rivals
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from mampc import plants
 from mampc.base.errors import MampcError, MampcWarning, StudyError
 from mampc.base.names import Names
 from mampc.base.words import Fault, LoadKind, Remark, Status
-from mampc.compare.tuning import Tuned, tune
 from mampc.controllers import MAMPC, MPC, ControllerBank, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
 from mampc.controllers.targets import Targets, targets
-from mampc.identification import (
-    Export,
-    Identified,
-    IOData,
-    PlannedTest,
-    Validation,
-    excite,
-    n4sid,
-    plan_test,
-    read_export,
-    validate,
-)
 from mampc.loop import loads
-from mampc.loop.batch import Batch, simulate_batch
 from mampc.loop.hypotheses import Hypothesis
 from mampc.loop.kalman_filter import KalmanFilter
-from mampc.loop.learnt_gains import LearntGains, learn_gains
 from mampc.loop.load_bank import LoadBank
 from mampc.loop.metrics import Metrics
-from mampc.loop.recorder import Recorder
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.regulator import Regulator
-from mampc.loop.replay import Difference, Recording, replay
 from mampc.loop.run import Run
 from mampc.loop.sensors import SensorChecks
 from mampc.loop.simulation import simulate
@@ -59,6 +45,40 @@ from mampc.systems.mismatch import Mismatch
 from mampc.systems.noise import Noise
 from mampc.systems.signals import prbs, steps
 from mampc.systems.state_space import StateSpace
+
+if TYPE_CHECKING:
+    from mampc import identification, rivals
+    from mampc.compare.tuning import Tuned, tune
+    from mampc.identification import (
+        Export,
+        Identified,
+        IOData,
+        PlannedTest,
+        Validation,
+        excite,
+        n4sid,
+        plan_test,
+        read_export,
+        validate,
+    )
+    from mampc.loop.batch import Batch, simulate_batch
+    from mampc.loop.learnt_gains import LearntGains, learn_gains
+    from mampc.loop.recorder import Recorder
+    from mampc.loop.replay import Difference, Recording, replay
+
+# What no controller in a loop needs is imported where it is first asked for.
+_LATER = {
+    "compare.tuning": ("Tuned", "tune"),
+    "identification": (
+        "Export", "IOData", "Identified", "PlannedTest", "Validation", "excite", "n4sid", "plan_test", "read_export",
+        "validate",
+    ),
+    "loop.batch": ("Batch", "simulate_batch"),
+    "loop.learnt_gains": ("LearntGains", "learn_gains"),
+    "loop.recorder": ("Recorder",),
+    "loop.replay": ("Difference", "Recording", "replay"),
+}  # fmt: skip
+_MODULE_OF = {name: module for module, names in _LATER.items() for name in names}
 
 __version__ = "0.1.0"
 
@@ -116,6 +136,7 @@ __all__ = [
     "Valves",
     "Zone",
     "excite",
+    "identification",
     "largest_offset",
     "learn_gains",
     "linearise",
@@ -134,3 +155,16 @@ __all__ = [
     "tune",
     "validate",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("identification", "rivals"):
+        return import_module(f"mampc.{name}")
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'mampc' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"mampc.{_MODULE_OF[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

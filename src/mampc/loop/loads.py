@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
 from mampc.base.checks import Array, as_array, as_matrix, as_number, as_vector
 from mampc.base.errors import MampcError, shown
-from mampc.identification.data import IOData
 from mampc.systems.state_space import StateSpace
+
+if TYPE_CHECKING:
+    from mampc.identification.data import IOData
 
 PLACES = ("input", "output", "measured")
 
