@@ -100,6 +100,37 @@ def test_convex_penalties_reach_the_optimum_of_an_independent_solver(name, on, s
     assert ours == pytest.approx(optimum, rel=2e-6)
 
 
+@pytest.mark.parametrize("seed", seeds(20, quick=4))
+@pytest.mark.parametrize("made", [rivals.GroupL2, rivals.CLOT], ids=["group_l2", "clot"])
+@pytest.mark.parametrize("weight", [0.0, 1.0, 1e9])
+@pytest.mark.parametrize("on", ["moves", "inputs"])
+def test_norms_are_the_same_in_whatever_units(on, weight, made, seed):
+    rng = np.random.default_rng(seed)
+    model, scales = random_model(seed, n=3, m=2, l=2), 10.0 ** rng.uniform(-6, 6, (2, 2))
+    x, deviation, u = rng.standard_normal(3), rng.standard_normal(2), rng.uniform(-1, 1, 2)
+
+    def decided(a, b):
+        scaled = mampc.StateSpace(
+            model.A, model.B / a, model.C * b[:, None], model.D * b[:, None] / a, model.dt,
+            model.u_op * a, model.y_op * b,
+        )  # fmt: skip
+        limits = mampc.Limits(
+            u_min=(model.u_op - 1) * a, u_max=(model.u_op + 1) * a, y_max=(model.y_op + 1) * b
+        )
+        problem = mampc.TrackingProblem(
+            scaled, prediction_horizon=8, control_horizon=4, output_weight=1 / b**2, move_weight=0.1 / a**2,
+            limits=limits,
+        )  # fmt: skip
+        controller = rivals.Penalised(problem, penalty=made(weight=weight, size=0.5 * a), on=on)
+        decision = controller.step(
+            controller.initial_state((model.u_op + u) * a), x, (model.y_op + deviation) * b
+        )
+        assert not decision.status.name.startswith("HELD")
+        return decision.plan / a
+
+    np.testing.assert_allclose(decided(*scales), decided(np.ones(2), np.ones(2)), atol=1e-4)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_riccati_weight_is_the_cost_of_going_on_for_ever(seed):
     """The optimum is that of an independent solver with the terminal cost of the Riccati equation added."""

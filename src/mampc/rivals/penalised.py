@@ -2,9 +2,10 @@
 
     minimise   J(d) + penalty(z / size)    within the limits
 
-with z the moves d ("minimum attention"), or the inputs less their steady target, v = u - u_s ("hands off"). The
-program in (violations, d, t), |z| <= t, has the penalty's majoriser for linear and quadratic terms; it is solved again
-at each new point until the objective settles. Entries that are nothing beside the largest are zero.
+with z the moves d ("minimum attention"), or the inputs less their steady target, v = u - u_s ("hands off"). Norms go
+to a conic solver. For a separable penalty the program in (violations, d, t), |z| <= t, has its majoriser for linear and
+quadratic terms, and is solved again at each new point until the objective settles. Entries that are nothing beside the
+largest are zero.
 """
 
 from __future__ import annotations
@@ -23,16 +24,15 @@ from mampc.methods.method import HELD_BY, Plan
 from mampc.program.daqp import DaqpSolver
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
-from mampc.program.qp import UNBOUNDED
+from mampc.program.qp import UNBOUNDED, QuadraticProgram
 from mampc.program.sample import Sample
 from mampc.program.steady import Steady, SteadyTarget
 from mampc.program.tail import square_root
-from mampc.rivals.penalties import Penalty
+from mampc.rivals.norms import Norm, NormsSolver
+from mampc.rivals.penalties import Norms, Separable
 
 CURVATURE = 1e-7  # of t, relative to the moves' in units of size: daqp wants a strictly convex program
 ZERO = 1e-5  # of the largest |z| / size: below it an entry is none
-VANISHING = 1e-3  # of the largest: where a norm goes on shrinking below it, it goes to zero
-PATIENCE = 5  # rounds before a norm is believed to vanish
 ON = ("moves", "inputs")
 TERMINALS = (None, "riccati")
 
@@ -56,11 +56,11 @@ class Penalised(Controller):
     """
 
     def __init__(
-        self, problem: TrackingProblem, *, penalty: Penalty, on: str = "moves", terminal: str | None = None,
+        self, problem: TrackingProblem, *, penalty: Separable | Norms, on: str = "moves", terminal: str | None = None,
         rounds: int = 200, tolerance: float = 1e-9,
     ) -> None:  # fmt: skip
         super().__init__(problem)
-        if not isinstance(penalty, Penalty):
+        if not isinstance(penalty, Separable | Norms):
             raise MampcError(f"penalty: expected one of mampc.rivals, received {type(penalty).__name__}")
         if on not in ON or terminal not in TERMINALS:
             raise MampcError(
@@ -78,73 +78,91 @@ class Penalised(Controller):
         self._terminal = _Terminal(problem, self.condensed.parameter) if terminal else None
         n = self.condensed.n_moves
         self._z = (self.condensed.cumulate if self._on_inputs else np.eye(n)) / self._size[:, None]
+        self._H_beside = self._terminal.H if self._terminal is not None else np.zeros((n, n))
+        self._norms: list[tuple[float, list[int]]] = []
+        if isinstance(penalty, Norms):
+            self._norms = penalty.norms(*self._shape)
+            self._conic = self._with_norms()
         self._kept: tuple[bytes, DaqpSolver] | None = None
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
-        """Majorise and minimise, from the plan without penalty on."""
+        """The optimum for norms and convex penalties, a stationary point for concave ones."""
         if sample.frozen is not None:  # plain MPC while inputs are in manual
             return self._unrestricted(sample, state)
-        n, v = self.condensed.n_moves, self.condensed.n_violations
         p = sample.parameter
-        needs_target = self._on_inputs or self._terminal is not None
-        steady = self._target.at(p) if needs_target else None
-        z0 = np.zeros(n)
-        if self._on_inputs and steady is not None:
-            z0 = np.tile(sample.u_previous - steady.u, self.problem.control_horizon) / self._size
-        f_terminal: Array = np.zeros(n)
-        H_terminal: Array = np.zeros((n, n))
-        if self._terminal is not None and steady is not None:
-            f_terminal, H_terminal = self._terminal.terms(p, steady)
+        z0: Array = np.zeros(self.condensed.n_moves)
+        f: Array = np.zeros(self.condensed.n_moves)
+        if self._on_inputs or self._terminal is not None:
+            steady = self._target.at(p)
+            if self._on_inputs:
+                z0 = np.tile(sample.u_previous - steady.u, self.problem.control_horizon) / self._size
+            if self._terminal is not None:
+                f = self._terminal.linear(p, steady)
+        if isinstance(self.penalty, Separable):
+            plan = self._majorised(self.penalty, sample, z0, f)
+        else:
+            plan = self._of_norms(sample, z0, f)
+        return plan if plan.moves is None else plan._replace(moves=self._without_nothing(plan.moves, z0))
+
+    def _of_norms(self, sample: Sample, z0: Array, f: Array) -> Plan:
+        """The optimum for a sum of norms; f is linear in the moves and beside the tracking cost, as below."""
+        v = self.condensed.n_violations
+        linear = sample.f.copy()
+        linear[v:] += f
+        constants = [z0[entries] for _, entries in self._norms]
+        solution = self._conic.solve(linear, sample.lower, sample.upper, constants)
+        if solution.z is None:
+            return Plan(None, HELD_BY[solution.status], solution.iterations)
+        return Plan(solution.z[v:], Status.SETTLED, solution.iterations)
+
+    def _majorised(self, penalty: Separable, sample: Sample, z0: Array, f: Array) -> Plan:
+        """Majorise and minimise, from the plan without penalty on."""
+        n, v = self.condensed.n_moves, self.condensed.n_violations
         lower = np.concatenate([sample.lower, z0, -z0])
         upper = np.concatenate([sample.upper, np.full(2 * n, UNBOUNDED)])
-        d, rounds, last = sample.moves, 0, np.inf
-        vanished, before, largest = np.zeros(n, dtype=bool), np.zeros(n), 0.0
-        beyond = 10 * (np.abs(sample.f_moves) * self._size).max() + self.penalty.weight
+        d, last, status = sample.moves, np.inf, Status.ITERATION_LIMIT
         for rounds in range(1, self._rounds + 1):
-            a = np.abs(self._z @ d + z0).reshape(self._shape)
-            if rounds == 1:  # what is zero by chance would stay so
-                a = np.maximum(a, VANISHING * a.max())
-            c, q = (term.ravel() for term in self.penalty.majoriser(a))
-            # Quadratic terms alone never reach zero: a norm that vanishes gets an l1 weight beyond any gradient.
-            norm = np.divide(self.penalty.weight, q, out=np.full(n, np.inf), where=(c == 0) & (q > 0))
-            if rounds == 1:
-                largest = norm[np.isfinite(norm)].max(initial=0.0)  # with no penalty on
-            elif rounds > PATIENCE:
-                vanished |= (norm < VANISHING * largest) & (norm < before)
-            before = norm
-            c, q = np.where(vanished, beyond, c), np.where(vanished, 0.0, q)
-            f = np.concatenate([sample.f, c])
-            f[v : v + n] += f_terminal + self._z.T @ (q * z0)
-            solver = self._solver_for(q, H_terminal)
+            c, q = (term.ravel() for term in penalty.majoriser(self._sizes(d, z0)))
+            linear = np.concatenate([sample.f, c])
+            linear[v : v + n] += f + self._z.T @ (q * z0)
+            solver = self._solver_for(q)
             solver.start()
-            solution = solver.solve(f, lower, upper)
+            solution = solver.solve(linear, lower, upper)
             if solution.z is None:
                 if rounds == 1:
                     return Plan(None, HELD_BY[solution.status], rounds)
                 break
             d = solution.z[v : v + n]
-            value = self._value(sample, d, z0, f_terminal, H_terminal)
-            still = (
-                2 * PATIENCE if np.isfinite(norm).any() else 1
-            )  # rounds in which a norm may begin to vanish
-            settled = last - value <= self._tolerance * abs(value) and rounds > still
-            if not self.penalty.repeated or settled:
+            value = self._value(sample, d, z0, f)
+            if not penalty.repeated or last - value <= self._tolerance * abs(value):
+                status = Status.SETTLED
                 break
             last = value
-        settled = rounds < self._rounds
-        status = Status.SETTLED if settled else Status.ITERATION_LIMIT
-        return Plan(self._without_nothing(d, z0), status, rounds)
+        return Plan(d, status, rounds)
 
-    def _value(self, sample: Sample, d: Array, z0: Array, f: Array, H: Array) -> float:
-        a = np.abs(self._z @ d + z0).reshape(self._shape)
-        return float(self.condensed.cost(sample, d) + d @ (0.5 * H @ d + f) + self.penalty.value(a))
+    def _sizes(self, d: Array, z0: Array) -> Array:
+        """a of the penalty, shape (nc, m)."""
+        return np.abs(self._z @ d + z0).reshape(self._shape)
 
-    def _solver_for(self, q: Array, H_terminal: Array) -> DaqpSolver:
+    def _value(self, sample: Sample, d: Array, z0: Array, f: Array) -> float:
+        beside = d @ (0.5 * self._H_beside @ d + f)
+        return float(self.condensed.cost(sample, d) + beside + self.penalty.value(self._sizes(d, z0)))
+
+    def _with_norms(self) -> NormsSolver:
+        """The solver for the norms beside the problem in (violations, d)."""
+        program, v = self.condensed.program, self.condensed.n_violations
+        H = program.H.copy()
+        H[v:, v:] += self._H_beside
+        rows = np.hstack([np.zeros((len(self._z), v)), self._z])
+        norms = [Norm(weight, rows[entries]) for weight, entries in self._norms]
+        return NormsSolver(QuadraticProgram(H, program.A, program.n_simple), norms)
+
+    def _solver_for(self, q: Array) -> DaqpSolver:
         """The solver for quadratic terms q; it stays while they do."""
         key = q.tobytes()
         if self._kept is None or self._kept[0] != key:
             curvature = CURVATURE * (np.diag(self.condensed.H) * self._size**2).mean()
-            H = self._z.T @ (q[:, None] * self._z) + H_terminal
+            H = self._z.T @ (q[:, None] * self._z) + self._H_beside
             program = with_sizes(self.condensed, self._z, H, np.full(len(q), curvature))
             self._kept = key, DaqpSolver(program, tolerance=1e-9 * np.sqrt(CURVATURE))
         return self._kept[1]
@@ -183,11 +201,12 @@ class _Terminal:
         response = prediction.state_response
         self._of_moves = self._root @ np.hstack([response[n_p - j][:, :m] for j in range(n_c)])
         self._power, self._response = prediction.final_power, response[-1]
-        self._H = 2 * self._of_moves.T @ self._of_moves
+        self.H = 2 * self._of_moves.T @ self._of_moves
 
-    def terms(self, p: Array, steady: Steady) -> tuple[Array, Array]:
-        """Linear and quadratic term in the moves."""
+    def linear(self, p: Array, steady: Steady) -> Array:
+        """The linear term in the moves; H is the Hessian."""
         at = self._parameter
         applied = np.concatenate([p[at.u_deviation] + p[at.input_disturbance], p[at.measured_disturbance]])
         free = self._power @ p[at.x] + self._response @ applied
-        return 2 * self._of_moves.T @ (self._root @ (free - steady.x)), self._H
+        linear: Array = 2 * self._of_moves.T @ (self._root @ (free - steady.x))
+        return linear

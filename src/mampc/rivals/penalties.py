@@ -1,8 +1,9 @@
 """Penalties that make a vector sparse, and what majorises them.
 
-Each is `weight` times a function of a = |z| / size, with one size per input: a change of units changes nothing. About
-a point every penalty lies below c |z| + q z^2 / 2 + constant and touches it there; minimising that again and again
-never raises the objective (majorise-minimise; local linear approximation where the penalty is concave).
+Each is `weight` times a function of a = |z| / size, with one size per input: a change of units changes nothing. One
+that is separable lies below c a + q a^2 / 2 + constant about a point and touches it there; minimising that again and
+again never raises the objective (majorise-minimise; local linear approximation where the penalty is concave). The
+others are sums of norms, each of some of the entries.
 """
 
 from __future__ import annotations
@@ -14,8 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, as_number
-
-LEAST = 1e-7  # of a norm, in units of size: nearer to zero it counts as this
 
 
 class Majoriser(NamedTuple):
@@ -37,8 +36,6 @@ class Penalty(ABC):
     weight: float = 1.0
     size: Any = 1.0
 
-    repeated = True  # whether one majoriser is not enough
-
     def __post_init__(self) -> None:
         as_number("weight", self.weight, 0.0)
 
@@ -46,13 +43,31 @@ class Penalty(ABC):
     def value(self, a: Array) -> float:
         """The penalty of a, shape (nc, m)."""
 
+
+class Separable(Penalty):
+    """A sum over the entries."""
+
+    repeated = True  # whether one majoriser is not enough
+
     @abstractmethod
     def majoriser(self, a: Array) -> Majoriser:
         """What lies above it and touches it at a, shape (nc, m)."""
 
 
+class Norms(Penalty):
+    """A sum of weighted norms."""
+
+    @abstractmethod
+    def norms(self, n_c: int, m: int) -> list[tuple[float, list[int]]]:
+        """Weight and entries of each, numbered sample by sample."""
+
+    def value(self, a: Array) -> float:
+        entries = a.ravel()
+        return float(sum(w * np.linalg.norm(entries[chosen]) for w, chosen in self.norms(*a.shape)))
+
+
 @dataclass(frozen=True, kw_only=True)
-class L1(Penalty):
+class L1(Separable):
     """weight * sum a: minimum attention by l1 on moves (Nagahara and Nesic 2020), maximum hands-off and lasso-MPC on
     inputs (Nagahara et al. 2016; Gallieri and Maciejowski 2012)."""
 
@@ -66,7 +81,7 @@ class L1(Penalty):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ElasticNet(Penalty):
+class ElasticNet(Separable):
     """weight * sum (a + curvature a^2)."""
 
     curvature: float = 1.0
@@ -84,19 +99,15 @@ class ElasticNet(Penalty):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GroupL2(Penalty):
+class GroupL2(Norms):
     """weight * sum over samples of |a_j|_2: all inputs move together or none."""
 
-    def value(self, a: Array) -> float:
-        return float(self.weight * np.linalg.norm(a, axis=1).sum())
-
-    def majoriser(self, a: Array) -> Majoriser:
-        norm = np.maximum(np.linalg.norm(a, axis=1, keepdims=True), LEAST)
-        return Majoriser(np.zeros_like(a), np.broadcast_to(self.weight / norm, a.shape))
+    def norms(self, n_c: int, m: int) -> list[tuple[float, list[int]]]:
+        return [(self.weight, [*range(j * m, (j + 1) * m)]) for j in range(n_c)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CLOT(Penalty):
+class CLOT(Norms):
     """weight * (sum a + ratio |a|_2), the norm over the whole horizon (Nagahara et al. 2020)."""
 
     ratio: float = 1.0
@@ -105,16 +116,13 @@ class CLOT(Penalty):
         super().__post_init__()
         as_number("ratio", self.ratio, 0.0)
 
-    def value(self, a: Array) -> float:
-        return float(self.weight * (a.sum() + self.ratio * np.linalg.norm(a)))
-
-    def majoriser(self, a: Array) -> Majoriser:
-        norm = max(float(np.linalg.norm(a)), LEAST)
-        return Majoriser(np.full_like(a, self.weight), np.full_like(a, self.weight * self.ratio / norm))
+    def norms(self, n_c: int, m: int) -> list[tuple[float, list[int]]]:
+        entries = [*range(n_c * m)]
+        return [*((self.weight, [i]) for i in entries), (self.weight * self.ratio, entries)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SCAD(Penalty):
+class SCAD(Separable):
     """weight * sum: a up to 1, then a parabola, constant from `shape` on (Fan and Li 2001; Ikeda 2024)."""
 
     shape: float = 3.7
@@ -134,7 +142,7 @@ class SCAD(Penalty):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MCP(Penalty):
+class MCP(Separable):
     """weight * sum: a - a^2 / (2 shape) up to shape, constant from there on (Zhang 2010; Ikeda 2024)."""
 
     shape: float = 2.0
@@ -152,7 +160,7 @@ class MCP(Penalty):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LogSum(Penalty):
+class LogSum(Separable):
     """weight * sum log(1 + a / knee) (Candes, Wakin and Boyd 2008; Ikeda 2024)."""
 
     knee: float = 0.1

@@ -11,7 +11,7 @@ from mampc.controllers.controller import Controller
 from mampc.controllers.mpc import MPC
 from mampc.program.problem import TrackingProblem
 from mampc.rivals.penalised import Penalised
-from mampc.rivals.penalties import CLOT, L1, MCP, SCAD, ElasticNet, GroupL2, LogSum, Penalty
+from mampc.rivals.penalties import CLOT, L1, MCP, SCAD, ElasticNet, GroupL2, LogSum, Norms, Separable
 from mampc.rivals.rules import DeadBand, EventTriggered, Periodic, QuietZone, Rounded, Rule
 from mampc.rivals.self_triggered import SelfTriggered
 from mampc.rivals.sparse_inputs import SparseInputs
@@ -24,7 +24,7 @@ RULES: dict[str, type[Rule]] = {
     "self_triggered": SelfTriggered,
     "quiet_zone": QuietZone,
 }
-PENALTIES: dict[str, type[Penalty]] = {
+PENALTIES: dict[str, type[Separable | Norms]] = {
     "l1": L1,
     "group_l2": GroupL2,
     "clot": CLOT,
