@@ -222,24 +222,13 @@ def test_moves_and_words_are_the_same_whatever_the_units(method, rules):
         for limited in (True, False):
             usual = decisions_in(np.ones(2), np.ones(2), seed, method, RULED[rules], limited)
             for _ in range(examples(2, quick=1)):
-                u, y = 1e3 ** rng.integers(-2, 3, 2).astype(float), 10.0 ** rng.uniform(-6, 6, 2)
+                u, y = 10.0 ** rng.uniform(-6, 6, 2), 10.0 ** rng.uniform(-6, 6, 2)
                 other = decisions_in(u, y, seed, method, RULED[rules], limited)
                 for a, b in zip(usual, other, strict=True):
                     np.testing.assert_array_equal(b.moves, a.moves)
                     assert (b.status, b.remarks) == (a.status, a.remarks)
                     np.testing.assert_allclose(b.changes / u, a.changes, atol=1e-6)
                     assert b.objective == pytest.approx(a.objective, rel=1e-6, abs=1e-9, nan_ok=True)
-
-
-@pytest.mark.parametrize("rules", RULED)
-def test_the_proven_optimum_has_the_same_moves_in_units_that_have_no_prefix(rules):
-    rng = np.random.default_rng(1)
-    for seed in range(examples(4, quick=2)):
-        usual = decisions_in(np.ones(2), np.ones(2), seed, "exact", RULED[rules])
-        u, y = 10.0 ** rng.uniform(-6, 6, 2), 10.0 ** rng.uniform(-6, 6, 2)
-        for a, b in zip(usual, decisions_in(u, y, seed, "exact", RULED[rules]), strict=True):
-            np.testing.assert_array_equal(b.moves, a.moves)
-            assert (b.status, b.remarks) == (a.status, a.remarks)
 
 
 @pytest.mark.parametrize("seed", range(4))

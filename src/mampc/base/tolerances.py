@@ -47,15 +47,19 @@ def left_open(objective: float, rounding: float) -> float:
     return (2 * sqrt(max(objective, 0.0)) + rounding) * rounding
 
 
-def prefix(curvature: Array, width: Array) -> Array:
-    """The power of a thousand in which each input is a number of ordinary size, all of shape (m,).
+def prefix(size: Array) -> Array:
+    """The power of a thousand in which each input is a number of ordinary size, given that of a move, shape (m,)."""
+    power: Array = 1000.0 ** np.round(np.log(size) / np.log(1000.0))
+    return power
+
+
+def size_of_move(curvature: Array, width: Array) -> Array:
+    """A move of each input that matters, all of shape (m,).
 
     Args:
         curvature: what its first move of size one costs, to the second order.
         width: of its range, infinite or zero where it has none.
     """
-    size = 3 / np.sqrt(curvature)  # a move that matters
+    size: Array = 3 / np.sqrt(curvature)
     wide = np.isfinite(width) & (width > 0)
-    size = np.where(wide, np.minimum(np.maximum(size, 1e-5 * width), width), size)
-    power: Array = 1000.0 ** np.round(np.log(size) / np.log(1000.0))
-    return power
+    return np.where(wide, np.minimum(np.maximum(size, 1e-5 * width), width), size)

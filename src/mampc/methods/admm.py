@@ -64,9 +64,9 @@ class ADMMSearch(HeuristicSearch):
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         first_step, mu = self._first_step, self._first_step.mu
-        data, unlimited, prefix = first_step.begin(sample), sample.moves, self.condensed.move_prefix
+        data, unlimited, unit = first_step.begin(sample), sample.moves, self.condensed.move_size
         starts = [np.zeros(len(unlimited)), unlimited] + ([guess] if guess is not None else [])
-        starts += list(self._random * prefix * (np.abs(unlimited) / prefix).max())
+        starts += list(self._random * unit * (np.abs(unlimited) / unit).max())
         proposed, rounds, moves = set(), 0, None
         for v in starts[: self.settings.starts]:
             w = np.zeros(len(v))

@@ -24,7 +24,7 @@ class HardThresholding(Heuristic):
     """Settings of iterative hard thresholding.
 
     Args:
-        tolerance: stop when no move changes by more, in input units (with the prefix of `base.tolerances`).
+        tolerance: stop when no move changes by more, as a share of one that matters (`CondensedQP.move_size`).
         max_iterations: gradient steps at most.
     """
 
@@ -46,15 +46,15 @@ class HardThresholdingSearch(HeuristicSearch):
     def __init__(self, settings: HardThresholding, condensed: CondensedQP, rules: MoveRules) -> None:
         super().__init__(settings, condensed, rules)
         self.settings = settings
-        prefix = condensed.move_prefix
-        H = condensed.H * np.outer(prefix, prefix)
+        unit = condensed.move_size
+        H = condensed.H * np.outer(unit, unit)
         self._lipschitz = float(np.linalg.eigvalsh(H)[-1])
         self._contraction = np.eye(condensed.n_moves) - H / self._lipschitz
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
-        L, prefix = self._lipschitz, self.condensed.move_prefix
-        step = -self._priced_limits(sample) * prefix / L
-        d: Array = (sample.moves if guess is None else guess) / prefix
+        L, unit = self._lipschitz, self.condensed.move_size
+        step = -self._priced_limits(sample) * unit / L
+        d: Array = (sample.moves if guess is None else guess) / unit
         pattern, rounds = d != 0, 0
         while rounds < self.settings.max_iterations:
             rounds += 1
@@ -64,4 +64,4 @@ class HardThresholdingSearch(HeuristicSearch):
             if np.abs(d - last).max() <= self.settings.tolerance:
                 break
         yield pattern
-        return Ended(rounds, d * prefix)
+        return Ended(rounds, d * unit)

@@ -71,15 +71,15 @@ class L1Search(HeuristicSearch):
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         proposed: dict[bytes, BoolArray] = {}
-        prefix = self.condensed.move_prefix
-        largest, rounds = (np.abs(sample.moves) / prefix).max(), 0
-        c = 1 / prefix
+        unit = self.condensed.move_size
+        largest, rounds = (np.abs(sample.moves) / unit).max(), 0
+        c = 1 / unit
         self._program.start()
         for _ in range(self.settings.reweightings + 1):
             d, programs = self._weighed(sample, allowance, c, ZERO * largest, proposed)
             rounds += programs
             c = 1 / (d + 0.1 * largest + 1e-300)
-            c /= c.max() * prefix
+            c /= c.max() * unit
         return (yield from proposing(proposed.values(), Ended(rounds)))
 
     def _weighed(
@@ -101,7 +101,7 @@ class L1Search(HeuristicSearch):
             solution = self._program.solve(f, lower, upper)
             if solution.z is None:
                 break
-            all_sizes = np.abs(solution.z[-2 * n : -n]) / self.condensed.move_prefix
+            all_sizes = np.abs(solution.z[-2 * n : -n]) / self.condensed.move_size
             size = np.where(all_sizes > zero, all_sizes, 0.0)
             admissible = self.admissible.allows(size > 0, allowance)
             # Above any price: here size alone decides, and prices when the patterns are polished.

@@ -32,7 +32,8 @@ class PenaltyDecomposition(Heuristic):
     Args:
         penalty: first mu, as a multiple of the mean curvature of the moves.
         growth: factor of mu, above 1.
-        tolerance: largest |d - v| at the end, and change of the plan that counts as settled, in input units.
+        tolerance: largest |d - v| at the end, and change of the plan that counts as settled, as shares of a move
+            that matters (`CondensedQP.move_size`).
         max_iterations: rounds of both steps for one mu.
     """
 
@@ -60,9 +61,9 @@ class PenaltyDecompositionSearch(HeuristicSearch):
         self.settings = settings
         self._mu = settings.penalty * mean_curvature(condensed)
         self._first_steps = [FirstStep(condensed, self._mu)]
-        prefix = np.concatenate([np.ones(condensed.n_violations), condensed.move_prefix])
-        least = float(np.linalg.eigvalsh(condensed.program.H * np.outer(prefix, prefix))[0])
-        self._largest_mu = 0.25 * LARGEST_CONDITION * least / condensed.move_prefix**2
+        unit = np.concatenate([np.ones(condensed.n_violations), condensed.move_size])
+        least = float(np.linalg.eigvalsh(condensed.program.H * np.outer(unit, unit))[0])
+        self._largest_mu = 0.25 * LARGEST_CONDITION * least / condensed.move_size**2
 
     def _propose(self, sample: Sample, allowance: Allowance, guess: Array | None) -> Proposals:
         settings, rounds = self.settings, 0
@@ -76,14 +77,14 @@ class PenaltyDecompositionSearch(HeuristicSearch):
             mu = first_step.mu
             inner = alternate(
                 first_step, sample, v, lambda d, mu=mu: self.admissible.select(mu * d * d, allowance),  # type: ignore[misc]
-                settings.tolerance, settings.max_iterations, self.condensed.move_prefix,
+                settings.tolerance, settings.max_iterations, self.condensed.move_size,
             )  # fmt: skip
             rounds += inner.rounds
             # Not settled by its last round, the alternation goes on with the next mu.
             if inner.status not in (QPStatus.OPTIMAL, QPStatus.ITERATION_LIMIT):
                 return Ended(rounds, failure=inner.status)
             v = inner.v
-            if (np.abs(inner.d - v) / self.condensed.move_prefix).max() <= settings.tolerance:
+            if (np.abs(inner.d - v) / self.condensed.move_size).max() <= settings.tolerance:
                 break
         yield v != 0
         return Ended(rounds, v)

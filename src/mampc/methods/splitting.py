@@ -108,6 +108,6 @@ class FirstStep:
 
 def mean_curvature(condensed: CondensedQP) -> Array:
     """The mean curvature of the cost in the moves, as weights, shape (n_moves,), that mean the same in all units."""
-    prefix = condensed.move_prefix
-    curvature: Array = (np.diag(condensed.H) * prefix**2).mean() / prefix**2
+    unit = condensed.move_size
+    curvature: Array = (np.diag(condensed.H) * unit**2).mean() / unit**2
     return curvature

@@ -28,7 +28,7 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray, ComplexArray
 from mampc.base.errors import MampcError, MampcWarning
-from mampc.base.tolerances import prefix
+from mampc.base.tolerances import prefix, size_of_move
 from mampc.program.bounds import Bounds
 from mampc.program.input_cost import distance_from_targets, price_of_inputs
 from mampc.program.least_distance import ROUNDING
@@ -57,6 +57,7 @@ class CondensedQP:
         condition: of U with columns of length 1, so that units do not count.
         input_prefix: power of a thousand in which each input is a number of ordinary size, shape (m,).
         move_prefix: the same for every move, shape (n_moves,).
+        move_size: of a move that matters, the same for all of an input, shape (n_moves,).
         growth: how many times larger the outputs that a state predicts become than they are at first.
         ill_conditioned: whether rounding may decide; a `MampcWarning` says so when the problem is made.
         parameter: where each quantity stands in p.
@@ -113,7 +114,9 @@ class CondensedQP:
         of_zones = np.zeros((0, n)) if zones is None else zones.root[:, None] * zones.theta
         self.H = self._H + 2 * of_zones.T @ of_zones
         width = problem.limits.u_max - problem.limits.u_min
-        self.input_prefix = prefix(0.5 * np.diag(self.H)[:m], width)
+        matters = size_of_move(0.5 * np.diag(self.H)[:m], width)
+        self.move_size = np.tile(matters, n_c)
+        self.input_prefix = prefix(matters)
         self.move_prefix = np.tile(self.input_prefix, n_c)
         self.growth = self._growth(problem.model.n_states, problem.model.n_outputs)
         self.ill_conditioned = max(self.condition, self.growth) > ILL_CONDITIONED
