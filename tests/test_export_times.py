@@ -30,9 +30,90 @@ def test_dates_and_times_in_two_columns(tmp_path):
     assert_whole(read(tmp_path, text(lines, header=("Date", "Time", "u", "y"))), dt=7200.0)
 
 
-def test_times_of_the_day_that_run_past_midnight_are_refused(tmp_path):
-    with pytest.raises(MampcError, match="have no date and run past midnight"):
-        read(tmp_path, text(rows(stamps(start="2024-04-13 23:55:00", form="%H:%M:%S"))))
+@pytest.mark.parametrize("form", ["%H:%M:%S", "%H:%M", "%I:%M:%S %p"])
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_times_without_a_date_go_on_the_next_day_past_midnight_and_that_is_told(tmp_path, form, newest_first):
+    lines = rows(stamps(start="2024-04-13 23:55:00", form=form))
+    export = read(tmp_path, text(lines[::-1] if newest_first else lines))
+    assert_whole(export)
+    assert told(export, "have no date", "next day" if not newest_first else "previous day")
+    assert told(export, "are hours and minutes") == (form == "%H:%M")
+
+
+def test_a_gap_past_midnight_stays_a_gap_and_times_that_go_back_by_day_are_refused(tmp_path):
+    lines = rows(stamps(start="2024-04-13 23:55:00", form="%H:%M:%S"))
+    assert [len(record) for record in read(tmp_path, text(lines[:4] + lines[8:])).records] == [4, 4]
+    lines = rows(stamps(form="%H:%M:%S"))
+    with pytest.raises(MampcError, match="have no date and go back in row 8; add a date"):
+        read(tmp_path, text(lines[6:] + lines[:6]))
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M", "%H:%M:%S"])
+def test_a_day_may_end_at_24(tmp_path, form):
+    times = stamps(start="2024-04-13 23:55:00", form=form)
+    times[5] = times[4].replace("23:59", "24:00")
+    assert_whole(read(tmp_path, text(rows(times))))
+
+
+@pytest.mark.parametrize(
+    ("am", "pm"), [("a.m.", "p.m."), ("a. m.", "p.\u00a0m."), ("上午", "下午"), ("πμ", "μμ")]
+)
+def test_halves_of_days_in_other_words(tmp_path, am, pm):
+    times = stamps(start="2024-04-13 11:55:00", form="%d/%m/%Y %I:%M:%S %p")
+    times = [time.replace("AM", am).replace("PM", pm) for time in times]
+    assert_whole(read(tmp_path, text(rows(times))))
+    front = [" ".join([time.split(" ")[0], time.split(" ", 2)[2], time.split(" ")[1]]) for time in times]
+    assert_whole(read(tmp_path, text(rows(front))))
+
+
+def test_halves_of_days_that_are_not_told_apart_are_refused(tmp_path):
+    times = stamps(start="2024-04-13 12:55:00", form="%d/%m/%Y %I:%M:%S")
+    with pytest.raises(MampcError, match="go back twelve hours before row 7; save them with 24 hours"):
+        read(tmp_path, text(rows(times)))
+
+
+@pytest.mark.parametrize(
+    "header", ["elapsed minutes", "Time in min", "t/min", "Zeit, min", "Zeit in Minuten"]
+)
+def test_a_unit_in_words_of_the_name_counts_and_is_told(tmp_path, header):
+    export = read(tmp_path, text(rows(range(len(U))), ";", (header, "u", "y")))
+    assert_whole(export)
+    assert told(export, "are in min")
+
+
+@pytest.mark.parametrize(
+    ("start", "form", "scale", "hint"),
+    [
+        ("2024-04-13 09:55:00", "%H%M%S", 1, "digits seem to be those of a clock"),
+        ("2024-04-13 09:55:00", "%y%m%d%H%M", 1, "digits seem to be those of a clock"),
+        ("2024-04-13 09:55:00", "%H.%M", 1, "digits seem to be those of a clock"),
+        (None, 45000.0, 1 / 24, "seconds or days of a spreadsheet"),
+        (None, 45000, 1, "seconds or days of a spreadsheet"),
+        (None, 0.0, 1 / 1440, "parts of a second, an hour or a day"),
+        (None, 0.4, 1 / 60, "parts of a second, an hour or a day"),
+    ],
+)
+def test_numbers_that_may_be_days_hours_or_digits_of_a_clock_are_asked_about(
+    tmp_path, start, form, scale, hint
+):
+    times = stamps(start=start, form=form) if start else [f"{form + scale * k:.8g}" for k in range(len(U))]
+    with pytest.raises(MampcError, match=hint):
+        read(tmp_path, text(rows(times)))
+    read(tmp_path, text(rows(times)), time_unit="s")
+
+
+def test_even_seconds_are_no_digits_of_a_clock(tmp_path):
+    assert_whole(read(tmp_path, text(rows([50 * k for k in range(len(U))]))), dt=50.0)
+    assert len(read(tmp_path, text(rows([50 * k + 200 * (k > 4) for k in range(len(U))]))).records) == 2
+
+
+def test_dates_that_stand_only_where_they_change_hold(tmp_path):
+    times = stamps(start="2024-04-13 23:55:00", form="%H:%M:%S")
+    dates = {0: "2024-04-13", 5: "2024-04-14"}
+    lines = [[dates.get(k, ""), *row] for k, row in enumerate(rows(times))]
+    export = read(tmp_path, text(lines, header=("date", "hour", "u", "y")))
+    assert_whole(export)
+    assert told(export, "dates in column 'date' held in 10 rows")
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,10 @@ Bad = Annotated[
 Good = Annotated[
     list[str] | None, typer.Option(help="A word of quality columns for a good value; repeat it.")
 ]
+NoQuality = Annotated[
+    list[str] | None,
+    typer.Option(help="A column that says nothing of others though it is called so; repeat it."),
+]
 Ranges = Annotated[
     list[str] | None,
     typer.Option("--range", help="Lowest and highest believable value, COLUMN=LOW:HIGH; repeat it."),
@@ -67,6 +71,7 @@ def inspect(
     encoding: Encoding = None,
     bad: Bad = None,
     good: Good = None,
+    no_quality: NoQuality = None,
     ranges: Ranges = None,
     fill: Fill = 0,
     on_change: OnChange = None,
@@ -92,7 +97,7 @@ def inspect(
     reading = _reading(
         inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
-        encoding=encoding, on_change=tuple(on_change or ()),
+        encoding=encoding, on_change=tuple(on_change or ()), no_quality=tuple(no_quality or ()),
     )  # fmt: skip
     target = export.parent / f"{export.stem}-columns.png" if out is None else out
     with progress() as show:
@@ -137,6 +142,7 @@ def identify(
     encoding: Encoding = None,
     bad: Bad = None,
     good: Good = None,
+    no_quality: NoQuality = None,
     ranges: Ranges = None,
     fill: Fill = 0,
     on_change: OnChange = None,
@@ -179,7 +185,7 @@ def identify(
     reading = _reading(
         inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
         time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
-        encoding=encoding, on_change=tuple(on_change or ()),
+        encoding=encoding, on_change=tuple(on_change or ()), no_quality=tuple(no_quality or ()),
     )  # fmt: skip
     settings = {
         "order": order, "weighting": weighting, "block_rows": block_rows, "feedthrough": feedthrough,

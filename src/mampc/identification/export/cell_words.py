@@ -14,6 +14,7 @@ PAIRS = (
     ("uit", "aan"), ("dicht", "open"),
 )  # fmt: skip
 STATES = frozenset(word for pair in PAIRS for word in pair)
+SPACES = "[\u00a0\u2007\u2009\u202f'’´`]"  # between groups of thousands
 WITH_UNIT = re.compile(
     r"([+-]?[0-9.,]*[0-9](?:[eE][+-]?[0-9]+)?)\s*((?:[^\W\d_]|[%‰°µ])(?:[^\W\d_]|[%°µ/²³*·^.-]|(?<=[^\W\d])[23](?!\d)){0,11})"
 )

@@ -13,13 +13,14 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import shown
 from mampc.identification.export.date_words import plain_date
+from mampc.identification.export.daytime import CLOCK_ONLY, doubt_half_days, on_next_days
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import find_column
-from mampc.identification.export.numbers import POINT, clean, is_number, numeric_share
+from mampc.identification.export.numbers import clean, is_number, numeric_share
+from mampc.identification.export.numeric_times import from_numbers
 from mampc.identification.export.sheet import Cells, Sheet
 from mampc.identification.export.stamps import (
     DATE_ONLY,
-    SECONDS,
     TimeReading,
     clock_put_back,
     elapsed,
@@ -33,10 +34,7 @@ NAMES = re.compile(
     r"(time|t|timestamp|date|datetime|elapsed|seconds|zeit|zeitstempel|temps|tiempo|tempo|tijd|tid)([\W_].*)?"
 )
 STAMP = re.compile(r"[^\d]{0,5}\d+[-/.:, T]+\w+[-/.:, T]+\d+.*|\d{8}[T ]\d{4,6}.*")
-CLOCK_ONLY = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AaPp][Mm])?")
 EXACT = ("time", "timestamp")
-LATEST = 4.2e9  # seconds: larger numbers are hardly seconds
-DAYS = ((36526.0, 73051.0), (730486.0, 767011.0))  # 2000 to 2100, counted as spreadsheets and as MATLAB do
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,7 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     origin: Any
     told = how.time_format is not None or how.time_zone is not None
     if len(columns) == 1 and how.time_format is None and numeric_share(_sampled(sheet, columns[0])) > 0.5:
-        seconds, origin = _from_numbers(sheet, columns[0], how, findings), None
+        seconds, origin = from_numbers(sheet, columns[0], how, findings), None
     elif len(columns) == 1 and not told and (plain := plain_stamps(sheet.chunks(columns))) is not None:
         seconds = clock_put_back(*plain, sheet, findings)
         origin = plain[1]
@@ -95,8 +93,9 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     else:
         cells = sheet.column(columns[0])
         if len(columns) == 2:
+            days = _held(cells, sheet.header[columns[0]], findings)
             hours = sheet.column(columns[1])
-            cells = [f"{day} {hour}".strip() for day, hour in zip(cells, hours, strict=True)]
+            cells = [f"{day} {hour}".strip() for day, hour in zip(days, hours, strict=True)]
         if isinstance(cells, list) and how.time_format is None and (spans := elapsed(cells)) is not None:
             findings.note(f"times in column {name!r} are spans such as {spans[0]!r}")
             seconds, origin = spans[1], None
@@ -104,11 +103,12 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
             seconds, origin = since_first(cells, how, sheet, findings)
         else:
             seconds, origin = from_stamps(cells, how, sheet, name, findings)
-            steps = np.diff(seconds)
-            if CLOCK_ONLY.fullmatch(cells[0]) and (steps < 0).any() and (steps > 0).any():
-                findings.doubt(
-                    f"times such as {cells[0]!r} in column {name!r} have no date and run past midnight; add one"
-                )
+            example = next((cell for cell in cells if CLOCK_ONLY.fullmatch(plain_date(cell))), None)
+            if example is not None and CLOCK_ONLY.fullmatch(plain_date(cells[-1])):
+                seconds = on_next_days(seconds, example, name, sheet, findings)
+                if example.count(":") == 1:
+                    findings.note(f"times such as {example!r} in column {name!r} are hours and minutes")
+        doubt_half_days(seconds, name, sheet, findings)
     unreadable = np.flatnonzero(np.isnan(seconds))
     if len(unreadable) == len(seconds):
         findings.doubt(
@@ -130,6 +130,18 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     if origin is not None and origin.tzinfo is not None:
         return Clock(name, columns, seconds, origin.replace(tzinfo=None), " UTC")
     return Clock(name, columns, seconds, origin)
+
+
+def _held(days: Cells, name: str, findings: Findings) -> list[str]:
+    """Dates, the last one in empty cells."""
+    held, last, put = [], "", 0
+    for day in map(str, days):
+        put += not day and bool(last)
+        last = day or last
+        held.append(last)
+    if put:
+        findings.change(f"dates in column {name!r} held in {put} rows without one")
+    return held
 
 
 def _cell(sheet: Sheet, columns: Sequence[int], at: int) -> str:
@@ -214,43 +226,3 @@ def _runs_on(sheet: Sheet, at: int, share: float, *, evenly: bool = False) -> bo
     if not evenly:
         return usual != 0 and bool(np.mean(steps * usual > 0) >= share)
     return usual not in (0.0, 1.0) and bool(np.mean(np.abs(steps - usual) <= 0.3 * abs(usual)) > share)
-
-
-def _from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) -> Array:
-    name = sheet.header[at]
-    values = np.empty(len(sheet))
-    start = 0
-    for [cells] in sheet.chunks([at]):
-        part = values[start : start + len(cells)]
-        start += len(cells)
-        if isinstance(cells, list):
-            words = (clean(cell).replace(",", ".") for cell in cells)
-            part[:] = [float(word) if POINT.fullmatch(word) else np.nan for word in words]
-        else:
-            part[:] = cells
-    found = re.search(r"_(ms|s|sec|min|h)$", name.casefold())
-    unit = how.time_unit or sheet.units.get(at, "").casefold() or (found.group(1) if found else "")
-    if unit in SECONDS:
-        if unit not in ("s", "sec", "second", "seconds"):
-            findings.note(f"times in column {name!r} are in {unit}")
-        return values * SECONDS[unit]
-    known = values[~np.isnan(values)]
-    least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-    usual = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
-    for size, unit_name in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
-        if LATEST * 0.1 * size < most < LATEST * size:
-            findings.note(f"times in column {name!r} are taken as {unit_name} since 1970")
-            return (values - least) / size + least / size
-    if most > LATEST:
-        findings.doubt(
-            f"times in column {name!r} are numbers as large as {most:.15g}; pass their unit (--time-unit) or their "
-            "format (--time-format '%Y%m%d%H%M%S')"
-        )
-    elif any(first < least and most < last for first, last in DAYS) and 0 < usual < 0.01:
-        findings.doubt(
-            f"times in column {name!r} are numbers from {least:.10g} to {most:.10g}, seconds or days of a spreadsheet; "
-            "pass their unit (--time-unit s, --time-unit d)"
-        )
-    else:
-        findings.note(f"times in column {name!r} are numbers, taken as seconds")
-    return values

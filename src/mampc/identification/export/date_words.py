@@ -7,8 +7,8 @@ import re
 # First letters that tell a month in English, German, French, Spanish, Italian, Dutch, Portuguese.
 MONTHS = (
     ("jan", "ene", "gen", "jän"), ("feb", "fév", "fev"), ("mar", "mär", "mrz", "maa", "mrt"), ("apr", "avr", "abr"),
-    ("may", "mai", "mag", "mei"), ("jun", "juin", "giu"), ("jul", "juil", "lug"), ("aug", "aoû", "aou", "ago"),
-    ("sep", "set"), ("oct", "okt", "ott", "out"), ("nov",), ("dec", "dez", "déc", "dic"),
+    ("may", "mai", "mag", "mei", "maj"), ("jun", "juin", "giu"), ("jul", "juil", "lug"), ("aug", "aoû", "aou", "ago"),
+    ("sep", "set"), ("oct", "okt", "ott", "out"), ("nov",), ("dec", "dez", "déc", "dic", "des"),
 )  # fmt: skip
 ENGLISH = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 BY_LETTERS = {word: name for name, words in zip(ENGLISH, MONTHS, strict=True) for word in words}
@@ -26,18 +26,30 @@ YEAR_LAST = re.compile(r"^(\w+ \d+) (\d+:[\d:.,]+) ?([+-]\d{4})?,? (\d{4})$")
 JOINED = re.compile(r"(/\d{4}):(\d\d:)")
 OFFSET = re.compile(r"(:\d\d(?:[.,]\d+)?(?: [AaPp][Mm])?) ([+-]\d\d:?\d\d)$")
 KANJI = str.maketrans({"年": "-", "月": "-", "日": " ", "時": ":", "时": ":", "分": ":", "秒": " "})
+HALVES = re.compile(
+    r"\s*\b(?:([ap])\.\s?m\b\.?)|\s*(?:(上午|午前|오전|π\.?μ\.?)|(下午|午後|오후|μ\.?μ\.?))\s*", re.IGNORECASE
+)
+HOUR = re.compile(r"(?<!\d)\d{1,2}:\d\d(:\d\d([.,]\d+)?)?")
+OF = re.compile(r"(?<=\w )(de|del) (?=\w)")
 DAY = re.compile(r"^(\d{1,2})\. ?(?=[^\W\d_])")
 
 
 def plain_date(stamp: str) -> str:
     """A stamp without its day of the week, with an English month, the year beside it, and its offset behind the time.
 
-    "Thu Nov 26 21:00:00 CET 2026" becomes "Nov 26 2026 21:00:00+0100", "02. März 2026 06:00" "02 Mar 2026 06:00".
+    "Thu Nov 26 21:00:00 CET 2026" becomes "Nov 26 2026 21:00:00+0100", "02. März 2026 06:00" "02 Mar 2026 06:00",
+    "2/3/2026 9:00 p. m." "2/3/2026 9:00 PM".
     """
-    if "年" in stamp:
-        return " ".join(stamp.translate(KANJI).split()).rstrip(":")
     if not any(map(str.isalpha, stamp)):
         return OFFSET.sub(r"\1\2", stamp)
+    half = HALVES.search(stamp)
+    if half:
+        name = "AM" if half[2] or (half[1] or "").casefold() == "a" else "PM"
+        around = f"{stamp[: half.start()]} {stamp[half.end() :]}".strip()
+        stamp = HOUR.sub(lambda hour: f"{hour[0]} {name}", around, count=1)
+    if "年" in stamp:
+        return " ".join(stamp.translate(KANJI).split()).rstrip(":")
+    stamp = OF.sub("", stamp)
     first = WEEKDAY.match(stamp)
     if first and not (first[2] and _month(first[1])):
         stamp = stamp[first.end() :]

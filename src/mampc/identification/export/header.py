@@ -8,11 +8,16 @@ from collections.abc import Collection, Sequence
 from typing import Any, TypeAlias
 
 from mampc.base.errors import shown
+from mampc.identification.export.cell_words import SPACES
 from mampc.identification.export.findings import Findings
 
 UNIT = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")
 
 NOT_UTF_8 = "text is not UTF-8: read as Windows-1252 (Western European)"
+NUMBER_LIKE = re.compile(
+    rf"[+\-−]?[\d.,]*\d[\d.,]*((?:{SPACES}| )\d{{3}}[.,\d]*)*([eEdD][+\-]?\d+)?", re.ASCII
+)
+RULE = re.compile(r"[-=+|_─]{2,}")
 REMARK = re.compile(r"%|#(?!N/A|REF!|VALUE!|DIV/0!|NAME\?|NUM!|NULL!)")  # spreadsheets' errors are cells
 
 Row: TypeAlias = tuple[int, list[str]]  # its number in the file, its cells
@@ -103,12 +108,18 @@ def fitted_header(
 
 
 def header_with(head: Sequence[Row], names: Sequence[str]) -> int | None:
-    """The first row in which all names stand."""
-    for i, (_, row) in enumerate(head):
-        plain = {UNIT.sub("", cell) for cell in row} | set(row)
-        if len(row) > 1 and all(name in plain for name in names):
-            return i
-    return None
+    """The row in which all names stand: the last one before numbers stand under them."""
+    found: int | None = None
+    at: list[int] = []
+    for i, (number, row) in enumerate(head):
+        if found is not None and number <= head[found][0]:
+            continue  # the same one with the # before it
+        if any(is_number_like(row[k]) for k in at if k < len(row)):
+            break
+        plain = [UNIT.sub("", cell) for cell in row]
+        if len(row) > 1 and all(name in plain or name in row for name in names):
+            found, at = i, [(row if name in row else plain).index(name) for name in names]
+    return found
 
 
 def joined_names(pair: Sequence[Row]) -> tuple[str, ...] | None:
@@ -158,4 +169,4 @@ def without_empty_end(row: Sequence[str]) -> tuple[str, ...]:
 
 
 def is_number_like(cell: str) -> bool:
-    return re.fullmatch(r"[+\-−]?[\d.,]*\d[\d.,]*([eE][+\-]?\d+)?", cell, re.ASCII) is not None
+    return NUMBER_LIKE.fullmatch(cell) is not None

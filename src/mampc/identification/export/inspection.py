@@ -16,7 +16,7 @@ from mampc.identification.export.findings import Findings
 from mampc.identification.export.grid import make_grid, pieces
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Column, read_numbers, says_numbers
-from mampc.identification.export.on_change import hint_of_changes, hold_last
+from mampc.identification.export.on_change import hint_of_changes, hold_last, sampled
 from mampc.identification.export.quality import drop_bad_quality, is_quality
 from mampc.identification.export.reading import ReadingOptions, listed, readings
 from mampc.identification.export.sheet import Sheet
@@ -107,9 +107,10 @@ def inspect_export(
     how, reading = readings(options, wanted or None)
     if dt is not None:
         dt = as_number("dt", dt, 0.0, exclusive=True)
-    sheet = open_table(source, wanted, how, findings, options.get("encoding"))
+    measured = listed(options.get("no_quality", ()))
+    sheet = open_table(source, wanted, how, findings, options.get("encoding"), measured)
     taken = [at for name in wanted if (at := find_column(sheet.header, name)) is not None]
-    qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet, at)]
+    qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet, at, measured)]
     clock = read_clock(sheet, [*taken, *qualities], how, findings)
     free = [
         at
@@ -120,15 +121,20 @@ def inspect_export(
     others = tuple(sheet.header[at] for at in free if at not in positions.values()) if not wanted else ()
     switches = [name for name in positions if name not in listed(outputs)]
     columns, values = read_numbers(sheet, positions, reading, findings, switches)
-    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
+    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), measured, findings)
     for column in columns:
         if column.marks:
             findings.note(str(column))
+    on_change = listed(options.get("on_change", ()))
     if wanted:
-        on_change = listed(options.get("on_change", ()))
         hint_of_changes(values, list(positions), on_change, findings)
+    if wanted or on_change:
         hold_last(sheet, positions, on_change, clock, values, findings)
-    grid = make_grid(clock, values, sheet.numbers, dt, findings)
+    held = np.array([name in on_change for name in positions])
+    clock, values, numbers = sampled(clock, values, sheet.numbers, held, dt, findings)
+    for column, own in zip(columns, values.T, strict=True):
+        column.values = own
+    grid = make_grid(clock, values, numbers, dt, findings)
     order, seconds = (np.arange(len(values)), np.arange(len(values)) * 1.0)
     lengths: tuple[int, ...] = (len(values),)
     if grid is not None:
@@ -137,13 +143,13 @@ def inspect_export(
             np.asarray(~np.isnan(values[order]).any(axis=1)) if wanted else np.ones(len(order), dtype=bool)
         )
         fill = options.get("fill", 0)
-        lengths = tuple(len(piece) for piece in pieces(grid, clock, usable, sheet.numbers, findings, fill))
+        lengths = tuple(len(piece) for piece in pieces(grid, clock, usable, numbers, findings, fill))
     elif clock is not None:
         order = np.argsort(clock.seconds, kind="stable")[: np.count_nonzero(~np.isnan(clock.seconds))]
         seconds = clock.seconds[order]
     for column in columns:
         if column.name not in (*listed(inputs), *listed(disturbances)):
-            note_suspects(column.name, column.values[order], sheet.numbers[order], findings)
+            note_suspects(column.name, column.values[order], numbers[order], findings)
     summaries = tuple(
         _summary(column, sheet.units.get(positions[column.name], column.unit), order) for column in columns
     )

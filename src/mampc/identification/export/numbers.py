@@ -12,15 +12,18 @@ import numpy.typing as npt
 
 from mampc.base.checks import LARGEST, Array, as_number
 from mampc.base.errors import MampcError, shown
-from mampc.identification.export.cell_words import STATES, states, without_unit
+from mampc.identification.export.cell_words import SPACES, STATES, states, without_unit
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.sheet import Cells, Sheet
 
 PLAIN_CHARACTERS = frozenset("0123456789+-.eE \n")
 POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+FORTRAN = re.compile(r"([+-]?(?:\d+[.,]\d*|[.,]\d+))[dD]([+-]?\d+)", re.ASCII)
 GROUPED = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", re.ASCII)  # 1,234 or 1,234,567.8
 GROUPED_FOR_SURE = re.compile(r"[+-]?\d{1,3}((,\d{3})+\.\d*|(,\d{3}){2,})", re.ASCII)
-SPACE = re.compile("[\u00a0\u202f'’]")  # between groups of thousands; a plain space may part two numbers
+SPACE = re.compile(SPACES)  # a plain space may part two numbers
+APART = re.compile(r"[+-]?\d{1,3}( \d{3})+([.,]\d*)?", re.ASCII)
+APART_FOR_SURE = re.compile(r"[+-]?\d{1,3}(( \d{3})+[.,]\d*|( \d{3}){2,})", re.ASCII)
 SPACED = re.compile(rf"[+-]?\d{{1,3}}({SPACE.pattern}\d{{3}})+(\.\d*)?", re.ASCII)
 EITHER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # 1,234: grouped thousands, or three decimals
 DIGIT = re.compile(r"\d")
@@ -31,7 +34,7 @@ MARK = re.compile(
 # Numbers that programs write in the place of a value: they count as marks only far from all other
 # values, or below zero where no other value is.
 MARKS = [
-    *(sign * float(nines) for nines in ("999", "9999", "99999", "999999", "9999999") for sign in (1, -1)),
+    *(sign * float("9" * count) for count in range(3, 13) for sign in (1, -1)),
     999.25, -999.25, 32767.0, -32768.0, 65535.0, -32767.0, 2147483647.0, -2147483648.0, 4294967295.0,
 ]  # fmt: skip
 SWAPPED = str.maketrans(",.", ".,")
@@ -128,8 +131,10 @@ def read_numbers(
 
 
 def clean(cell: str) -> str:
-    """A cell without spaces around it and with a plain minus sign."""
-    return cell.strip().replace("−", "-")
+    """A cell without spaces around it, with a plain minus sign, and E for Fortran's D."""
+    word = cell.strip().replace("−", "-")
+    found = FORTRAN.fullmatch(word)
+    return f"{found[1]}E{found[2]}" if found else word
 
 
 class _Reader:
@@ -143,6 +148,8 @@ class _Reader:
         self.either: list[tuple[int, str]] = []  # positions and cells such as 1,234
         self.grouped = grouped  # whether thousands are known to stand in groups
         self.states: dict[str, array[int]] = {}  # positions of words such as ON
+        self.apart: list[tuple[int, str]] = []  # positions and cells such as 1 234
+        self.spaced = False  # whether spaces are known to stand between thousands
         self.units: dict[str, list[tuple[int, str, str]]] = {}  # positions, numbers and cells such as 12 %
 
     def read(self, start: int, cells: Cells, rows: npt.NDArray[np.int64]) -> None:
@@ -170,6 +177,11 @@ class _Reader:
 
     def finish(self, rows: npt.NDArray[np.int64], findings: Findings, switches: Collection[str]) -> Column:
         column = self.column
+        for at, cell in self.apart:
+            if self.spaced:
+                column.values[at] = float(cell.replace(" ", ""))
+            else:
+                self.unclear.setdefault(cell, []).append(int(rows[at]))
         self._take_units(rows, findings)
         if column.name in switches:
             self._take_states(findings)
@@ -210,6 +222,8 @@ class _Reader:
         word = cell.translate(SWAPPED) if self.decimal == "," else cell
         if SPACED.fullmatch(word):
             word = SPACE.sub("", word)
+        elif APART_FOR_SURE.fullmatch(word):
+            self.spaced, word = True, word.replace(" ", "")
         if POINT.fullmatch(word):
             return float(word)
         if GROUPED.fullmatch(word):
@@ -221,6 +235,8 @@ class _Reader:
             self.column.mark(shown(cell), row)
             if cell.casefold() in STATES:
                 self.states.setdefault(cell.casefold(), array("q")).append(at)
+        elif APART.fullmatch(word):
+            self.apart.append((at, cell))
         else:
             number, unit = without_unit(word)
             if unit and (POINT.fullmatch(number) or GROUPED_FOR_SURE.fullmatch(number)):
@@ -302,7 +318,7 @@ def _decimal_mark(sheet: Sheet, columns: Sequence[int], findings: Findings) -> s
             for cell in cells if isinstance(cells, list) else ():
                 if "," not in cell and "." not in cell:
                     continue
-                word = SPACE.sub("", without_unit(clean(cell))[0])
+                word = _ungrouped(without_unit(clean(cell))[0])
                 if EITHER.fullmatch(word):
                     either = either or word
                     continue
@@ -328,13 +344,18 @@ def is_number(cell: str) -> bool:
     return _has_point(cell) or _has_point(cell.translate(SWAPPED)) or EITHER.fullmatch(cell) is not None
 
 
+def _ungrouped(word: str) -> str:
+    """Without spaces between thousands."""
+    return word.replace(" ", "") if APART_FOR_SURE.fullmatch(word) else SPACE.sub("", word)
+
+
 def _has_point(word: str) -> bool:
     return POINT.fullmatch(word) is not None or GROUPED_FOR_SURE.fullmatch(word) is not None
 
 
 def numeric_share(cells: Iterable[str]) -> float:
     """The share of numbers among the cells that hold anything, with either decimal mark; 0 where there is none."""
-    filled = [SPACE.sub("", clean(cell)) for cell in cells if cell]
+    filled = [_ungrouped(clean(cell)) for cell in cells if cell]
     numbers = sum(map(is_number, filled))
     return numbers / len(filled) if filled else 0.0
 

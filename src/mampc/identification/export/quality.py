@@ -38,15 +38,17 @@ OPC_GOOD = range(192, 256)  # the quality byte of OPC DA: its two highest bits a
 OPC_BAD = range(64)  # none of them is
 
 
-def quality_columns(sheet: Sheet, columns: Mapping[str, int]) -> dict[int, tuple[str, ...]]:
+def quality_columns(
+    sheet: Sheet, columns: Mapping[str, int], measured: Collection[str] = ()
+) -> dict[int, tuple[str, ...]]:
     """Which columns, by position, speak of which of the wanted ones, by name.
 
     "TI101.Quality" speaks of "TI101" and of "TI101.Value". "Quality", or any other name over words such as Good
     and Bad, speaks of all columns where it stands only once, else of its neighbour: the one on its left, but
-    where the first one has no values there, the one on its right.
+    where the first one has no values there, the one on its right. Columns named as `measured` speak of none.
     """
     header, taken = sheet.header, set(columns.values())
-    free = [at for at in range(len(header)) if at not in taken and not _measures(sheet, at)]
+    free = [at for at in range(len(header)) if at not in taken and not _measures(sheet, at, measured)]
     late = _spoken_later(sheet, free)
     found: dict[int, tuple[str, ...]] = {}
     general: dict[str, list[int]] = {}
@@ -67,13 +69,15 @@ def quality_columns(sheet: Sheet, columns: Mapping[str, int]) -> dict[int, tuple
     return found
 
 
-def is_quality(sheet: Sheet, at: int) -> bool:
+def is_quality(sheet: Sheet, at: int, measured: Collection[str] = ()) -> bool:
     """Whether a column speaks of others, by its name or its first cells."""
-    return not _measures(sheet, at) and (_is_general(sheet, at) or _speaks_of_any(sheet.header, at))
+    return not _measures(sheet, at, measured) and (_is_general(sheet, at) or _speaks_of_any(sheet.header, at))
 
 
-def _measures(sheet: Sheet, at: int) -> bool:
-    """Whether numbers with fractions stand there, such as the quality of a product."""
+def _measures(sheet: Sheet, at: int, measured: Collection[str]) -> bool:
+    """Whether it is named as measured, or numbers with fractions stand there, such as the quality of a product."""
+    if sheet.header[at] in measured or UNIT.sub("", sheet.header[at]) in measured:
+        return True
     return any(is_number(cell) and not CODE.fullmatch(cell) for cell in (row[at] for row in sheet.sample))
 
 
@@ -126,6 +130,7 @@ def drop_bad_quality(
     columns: Sequence[Column],
     positions: Mapping[str, int],
     good: Iterable[str],
+    measured: Collection[str],
     findings: Findings,
 ) -> tuple[int, ...]:
     """Leave no number whose quality is not known to be good; returns the columns that say so.
@@ -135,24 +140,25 @@ def drop_bad_quality(
         columns: its wanted columns, changed in place.
         positions: where they stand.
         good: further words that mean a good value.
+        measured: columns that are no qualities, whatever they are called.
         findings: receives a doubt where no word is known.
     """
     by_name = {column.name: column for column in columns}
-    speaking = quality_columns(sheet, positions)
+    speaking = quality_columns(sheet, positions, measured)
     for at, names in speaking.items():
         words = _words(sheet.column(at))
         denies = DENIAL.search(sheet.header[at].casefold()) is not None
         named = [str(word).strip().casefold() for word in good]
         if _is_remark(sheet, at):
             named.append("")
-        if _plain(sheet.header[at]) in TRUTHS:
-            named.append("1")
+        named += _in_numbers(sheet.header[at], words)
         is_good = _not_true(words) if denies else _good(words, named)
         if is_good is None:
             kinds = ", ".join(f"{shown(word)} ({count})" for word, count in Counter(words).most_common(5))
             findings.doubt(
                 f"column {sheet.header[at]!r} seems to say which values of {', '.join(names)} are good, but not how: "
-                f"{kinds}; name what is good in good (--good)"
+                f"{kinds}; name what is good in good (--good), or the column as one that says nothing of others "
+                "(no_quality, --no-quality)"
             )
             continue
         for name in names:
@@ -162,6 +168,14 @@ def drop_bad_quality(
             column.values[~is_good] = np.nan
         findings.note(f"column {sheet.header[at]!r} taken as the quality of {', '.join(names)}")
     return tuple(speaking)
+
+
+def _in_numbers(name: str, words: Sequence[str]) -> tuple[str, ...]:
+    """What means good by the last word of a name: true, certain in percent, or the only word there is."""
+    last = ["", *re.findall(r"[^\W\d_]+", name.casefold())][-1]
+    if last in TRUTHS or (last == "validity" and set(words) == {"1"}):
+        return ("1",)
+    return ("100",) if last in ("confidence", "conf") else ()
 
 
 def _good(words: Sequence[str], named: Collection[str]) -> BoolArray | None:

@@ -38,6 +38,7 @@ class ReadingOptions(TypedDict, total=False):
     encoding: of a text that is neither UTF-8 nor UTF-16, such as "cp932"; default Windows-1252.
     bad: further words and numbers that stand in the place of a missing value.
     good: words of quality columns that mean a good value.
+    no_quality: columns that say nothing of others, though they are called so, such as the quality of a product.
     ranges: lowest and highest believable value of columns, {"TI101": (0.0, 200.0)}.
     fill: up to so many samples in a row may be made up where they are missing: inputs are held, outputs lie on lines;
         default none.
@@ -52,6 +53,7 @@ class ReadingOptions(TypedDict, total=False):
     encoding: str | None
     bad: Sequence[str]
     good: Sequence[str]
+    no_quality: Sequence[str]
     ranges: Mapping[str, tuple[float, float]]
     fill: int
     on_change: Sequence[str]
@@ -147,14 +149,17 @@ def _read_table(
     findings: Findings,
 ) -> _Table:
     wanted = (*names.inputs, *names.disturbances, *names.outputs)
-    sheet = open_table(source, wanted, how, findings, options.get("encoding"))
+    sheet = open_table(
+        source, wanted, how, findings, options.get("encoding"), listed(options.get("no_quality", ()))
+    )
     positions = {name: _position(sheet.header, name) for name in wanted}
     units = {name: sheet.units[at] for name, at in positions.items() if at in sheet.units}
-    quality = tuple(quality_columns(sheet, positions))
+    measured = listed(options.get("no_quality", ()))
+    quality = tuple(quality_columns(sheet, positions, measured))
     clock = read_clock(sheet, [*positions.values(), *quality], how, findings)
     columns, values = read_numbers(sheet, positions, reading, findings, (*names.inputs, *names.disturbances))
     units = {column.name: column.unit for column in columns if column.unit} | units
-    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), findings)
+    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), measured, findings)
     for column in columns:
         if column.marks:
             findings.change(str(column))

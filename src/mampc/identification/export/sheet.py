@@ -23,6 +23,7 @@ from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import (
     NOT_UTF_8,
     REMARK,
+    RULE,
     Row,
     find_column,
     fitted_header,
@@ -45,6 +46,7 @@ FILE_LIMIT = 256 * 2**20  # bytes
 KIND = "CSV, Excel or Parquet file"
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 HEAD = 200  # rows among which the header is looked for
+MARK = "\ufeff"  # of the order of bytes, inside a text where files were put together
 CHUNK = 20_000  # rows parsed at a time
 BINARY = re.compile(rb"[\x00-\x08\x0e-\x19\x1c-\x1f]|\x1a(?!\s*$)")
 
@@ -115,12 +117,17 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings, encoding: 
         raise MampcError(
             f"{source}: expected a readable {KIND}, received HTML or XML; save it as .xlsx or CSV"
         )
+    whole, content = len(content), content.rstrip(b"\0") if content.endswith(bytes(8)) else content
+    if len(content) < whole:
+        findings.note(f"{whole - len(content)} bytes of nothing at the end of the file left out")
     encoding = _encoding(source, content, findings) if encoding is None else _known(encoding)
+    marked = content.find(codecs.BOM_UTF8, 3) > 0
 
     def parsed(separator: str) -> Rows:
         def rows() -> Iterator[list[Row]]:
             text = io.TextIOWrapper(io.BytesIO(content), encoding=encoding, newline="")
-            reader = csv.reader(text, delimiter=separator, skipinitialspace=separator == " ")
+            lines = (line.replace(MARK, "") for line in text) if marked else text
+            reader = csv.reader(lines, delimiter=separator, skipinitialspace=separator == " ")
             try:
                 while block := [(reader.line_num, row) for row in islice(reader, CHUNK)]:
                     yield block
@@ -143,6 +150,8 @@ def _known(encoding: str) -> str:
 
 def _encoding(path: str | Path, content: bytes, findings: Findings) -> str:
     """The encoding of a text; raises `MampcError` where it is none."""
+    if content[:4] in (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE):
+        return "utf-32"
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     found, zeros = "", content[:2000].count(0)
@@ -231,6 +240,7 @@ def _measured(
     numbers = array("q")
     descriptions: list[tuple[int, list[str]]] = []
     ragged: list[tuple[int, list[str]]] = []
+    lines: list[int] = []
     remarks: list[int] = []
     hollow: dict[int, str] = {}  # rows with fewer fields and no number: all their values are missing
     broken: list[int] = []
@@ -238,10 +248,14 @@ def _measured(
     sample: list[list[str]] = []
     previous = header_number
     for number, row in chain.from_iterable(_from(rows, header_number)):
-        tall, previous = number - previous > 1 and any("\n" in cell or "\r" in cell for cell in row), number
+        before, previous = previous, number
+        tall = number - before > 1 and any("\n" in cell or "\r" in cell for cell in row)
         if len(row) != width:
             cells = _stripped(row)
             if not any(cells):
+                continue
+            if RULE.fullmatch("".join(cells)):
+                lines.append(number)
                 continue
             if REMARK.match(cells[0]):
                 remarks.append(number)
@@ -264,6 +278,9 @@ def _measured(
         if row[0] == header[0] and tuple(_stripped(row))[:width] == header:
             repeated.append(number)
             continue
+        if repeated and before == repeated[-1] and _stripped(row) in [cells for _, cells in descriptions]:
+            repeated.append(number)  # what stands under the header
+            continue
         numbers.append(number)
     footer: list[int] = []
     while numbers and numbers[-1] in hollow:
@@ -272,7 +289,9 @@ def _measured(
         findings.note(f"{rows_text(footer)} after the table left out: {shown(hollow[footer[-1]])}")
     if remarks:
         findings.note(f"remarks behind a # in {rows_text(remarks)} left out")
-    skipped = frozenset([*repeated, *remarks, *footer, *(number for number, _ in [*descriptions, *ragged])])
+    skipped = frozenset(
+        [*repeated, *lines, *remarks, *footer, *(number for number, _ in [*descriptions, *ragged])]
+    )
     names_in = f"the names stand in row {header_number}"
     if len(ragged) == 1:
         findings.doubt(

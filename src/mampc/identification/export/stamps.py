@@ -14,6 +14,7 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
 from mampc.identification.export.date_words import plain_date
+from mampc.identification.export.daytime import DAY, MIDNIGHT, from_midnight, has_midnight
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.sheet import Cells, Sheet
 
@@ -23,6 +24,8 @@ SECONDS = {
     "min": 60.0, "minute": 60.0, "minutes": 60.0,
     "h": 3600.0, "hr": 3600.0, "hour": 3600.0, "hours": 3600.0,
     "d": 86400.0, "day": 86400.0, "days": 86400.0,
+    "sekunden": 1.0, "secondes": 1.0, "segundos": 1.0, "secondi": 1.0, "minuten": 60.0, "minutos": 60.0,
+    "minuti": 60.0, "stunden": 3600.0, "heures": 3600.0, "horas": 3600.0, "ore": 3600.0, "tage": 86400.0,
 }  # fmt: skip
 DATE_ONLY = re.compile(r"\d+[-/.]\w+[-/.]\d+|\w+ \w+,? \d+")
 OFFSET = re.compile(r".*\d(Z|[+-]\d\d(:?\d\d)?)")
@@ -40,6 +43,7 @@ YEAR_FIRST = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d")
 PLAIN = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d{1,6})?)?", re.ASCII)
 SPAN = re.compile(r"\d+ days?,? \d+:\d\d:\d\d(\.\d+)?|(2[4-9]|[3-9]\d|\d{3,}):\d\d:\d\d(\.\d+)?", re.ASCII)
 UTC = re.compile(r" ?(UTC|GMT)$")
+DIGIT, LETTER = re.compile(r"\d"), re.compile(r"[^\W\d_]")
 HOUR = 3600.0
 
 
@@ -103,7 +107,7 @@ def iso_stamps(blocks: Iterable[Sequence[Cells]]) -> Any:
     parts: list[Any] = []
     offsets = None
     for [cells] in blocks:
-        if not isinstance(cells, list):
+        if not isinstance(cells, list) or has_midnight(cells):
             return None
         kinds = {_has_offset(cell) for cell in cells if cell} | ({offsets} - {None})
         if len(kinds) != 1:
@@ -135,7 +139,10 @@ def from_stamps(
         findings.doubt(
             f"some times in column {name!r} have an offset from UTC such as {offsets[0]!r}, others have none"
         )
+    words, late = from_midnight(words)
     readings = list(_readings(words, how, bool(offsets)))
+    if late is not None:
+        readings = [stamps.where(~late, stamps + timedelta(seconds=DAY)) for stamps in readings]
     best = max(int(stamps.notna().sum()) for stamps in readings)
     readings = [stamps for stamps in readings if best and stamps.notna().sum() >= 0.99 * best]
     if not readings:
@@ -145,7 +152,7 @@ def from_stamps(
     found = [since_first(stamps, how, sheet, Findings(findings.origin)) for stamps in readings]
     choice = 0
     if not np.array_equal(found[0][0], found[1][0], equal_nan=True):
-        strays = [_unevenness(seconds) for seconds, _ in found]
+        strays = [unevenness(seconds) for seconds, _ in found]
         choice = int(np.argmin(strays))
         if max(strays) < 1.05 * min(strays) + 0.01:
             findings.doubt(
@@ -196,7 +203,7 @@ def _in_formats(series: Any, formats: Sequence[str], offsets: bool) -> Any:
     left = series[series != ""]
     for _ in range(4):  # such as with and without fractions of seconds, and without a time at midnight
         fitting = None
-        for cell in left.iloc[:20]:
+        for cell in _kinds(left.iloc[:50]):
             fitting = next(
                 (
                     form
@@ -219,6 +226,14 @@ def _in_formats(series: Any, formats: Sequence[str], offsets: bool) -> Any:
         if not len(left):
             break
     return stamps
+
+
+def _kinds(cells: Iterable[str]) -> list[str]:
+    """Two cells of each pattern of digits and letters: others are read as they are."""
+    found: dict[str, list[str]] = {}
+    for cell in cells:
+        found.setdefault(LETTER.sub("a", DIGIT.sub("0", cell)), []).append(cell)
+    return [cell for alike in list(found.values())[:10] for cell in dict.fromkeys((alike[0], alike[-1]))]
 
 
 def since_first(stamps: Any, how: TimeReading, sheet: Sheet, findings: Findings) -> tuple[Array, Any]:
@@ -251,7 +266,7 @@ def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
 
 def elapsed(cells: Sequence[str]) -> tuple[str, Array] | None:
     """A span such as "30:00:00" or "1 days 06:00:00", and all of them in seconds; None where they are times of days."""
-    longest = next((cell for cell in cells if SPAN.fullmatch(cell)), None)
+    longest = next((cell for cell in cells if SPAN.fullmatch(cell) and not MIDNIGHT.match(cell)), None)
     if longest is None:
         return None
     import pandas as pd
@@ -293,7 +308,7 @@ def _same_cells(sheet: Sheet, one: int, other: int) -> bool:
     return all(cells[one] == cells[other] for cells in (list(sheet.column(at)) for at in columns))
 
 
-def _unevenness(seconds: Array) -> float:
+def unevenness(seconds: Array) -> float:
     """By how much the steps differ from the usual one, in all, as a multiple of it."""
     steps = np.abs(np.diff(seconds[~np.isnan(seconds)]))
     usual = float(np.median(steps)) if len(steps) else 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,12 @@ MOST_TAGS = 2000
 
 
 def open_table(
-    source: Any, names: Sequence[str], how: TimeReading, findings: Findings, encoding: str | None = None
+    source: Any,
+    names: Sequence[str],
+    how: TimeReading,
+    findings: Findings,
+    encoding: str | None = None,
+    measured: Collection[str] = (),
 ) -> Sheet:
     """The table in a file, as `open_sheet` has it, tall ones with one column a tag.
 
@@ -44,6 +49,7 @@ def open_table(
         how: the time column is read.
         findings: receives notes and doubts.
         encoding: of a text; None to see it from its bytes.
+        measured: columns that are no qualities, whatever they are called.
 
     Raises:
         MampcError: no such file, or nothing in it that could be such a table.
@@ -52,12 +58,12 @@ def open_table(
     try:
         sheet = open_sheet(source, names, trial, encoding)
     except MampcError as error:
-        tall = _tall(source, names, how, findings, encoding) if trial.doubts else None
+        tall = _tall(source, names, how, findings, encoding, measured) if trial.doubts else None
         if tall is None:
             raise error from None
         return tall
     if not names and _named(sheet.header, TAGS) is not None:
-        tall = _tall(source, names, how, findings, encoding)
+        tall = _tall(source, names, how, findings, encoding, measured)
         if tall is not None:
             return tall
     findings.take(trial)
@@ -65,7 +71,12 @@ def open_table(
 
 
 def _tall(
-    source: Any, names: Sequence[str], how: TimeReading, findings: Findings, encoding: str | None
+    source: Any,
+    names: Sequence[str],
+    how: TimeReading,
+    findings: Findings,
+    encoding: str | None,
+    measured: Collection[str],
 ) -> Sheet | None:
     """A tall table as one with a column a tag; None where it is none."""
     trial = Findings(findings.origin)
@@ -77,7 +88,7 @@ def _tall(
     if tags is None:
         return None
     others = [at for at in range(len(sheet.header)) if at != tags]
-    quality = [at for at in others if is_quality(sheet, at)]
+    quality = [at for at in others if is_quality(sheet, at, measured)]
     value = _named(sheet.header, VALUES)
     times = time_columns(
         sheet, [tags, *quality, *([] if value is None else [value])], how, Findings(findings.origin)

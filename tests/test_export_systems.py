@@ -1,0 +1,94 @@
+"""Exports as particular systems write them, and what their texts went through."""
+
+import numpy as np
+import pytest
+
+from mampc import MampcError, read_export
+from mampc.identification.export import inspect_export
+from small_exports import U, Y, assert_whole, read, rows, stamps, text, told, write
+
+STAMPS = stamps()
+QUALITY_100 = [[time, u, "100", y, "100"] for time, u, y in rows()]
+SYSTEMS = {
+    "names above a block of descriptions": "Tagname,,u,y\nDescriptor,,Valve,Level\nStart,01-Apr-2024\n,,,\n"
+    + text([[time, "", u, y] for time, u, y in rows()], header=("Timestamp", "", "u", "y")),
+    "a table of a terminal": "  time | u | y\n------+---+---\n"
+    + text([[f" {cell} " for cell in row] for row in rows()], "|", (" time ", " u ", " y "))
+    + "(12 rows)\n",
+    "confidence in percent": text(QUALITY_100, header=("time", "u", "u Confidence", "y", "y Confidence")),
+    "validity that is always 1": text(
+        [[time, u, "1", y, "1"] for time, u, y in rows()], header=("time", "u", "u.Validity", "y", "y.Validity")
+    ),
+    "pages with names and units": "\n".join(
+        f"Page {k // 6};;\ntime;u;y\nhh:mm;%;m\n{';'.join(row)}" if k % 6 == 0 else ";".join(row)
+        for k, row in enumerate(rows())
+    ),
+    "files put together, each with a mark of its bytes": "\ufeff"
+    + text(rows()[:6])
+    + "\ufeff"
+    + text(rows()[6:]),
+    "a mark of bytes before a row": text(rows()[:6]) + "\ufeff" + text(rows())[len(text(rows()[:6])) :],
+    "Fortran": text([[time, f"{float(u):.4E}".replace("E", "D"), y] for time, u, y in rows()]),
+    "zeros at the end": text(rows()) + "\0" * 500,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", SYSTEMS)
+def test_what_systems_write_around_their_numbers(tmp_path, form):
+    assert_whole(read(tmp_path, SYSTEMS[form]))
+
+
+def test_text_of_four_bytes_a_letter(tmp_path):
+    assert_whole(read(tmp_path, text(rows()), "utf-32"))
+
+
+@pytest.mark.parametrize("space", ["\u2009", "\u2007", "\u00a0", "´", " "])
+def test_thousands_apart(tmp_path, space):
+    u = [f"{value * 1e6:,.1f}".replace(",", space).replace(".", ",") for value in U]
+    y = [f"{value * 100:,.1f}".replace(",", space).replace(".", ",") for value in Y]
+    [record] = read(tmp_path, text(rows(u=u, y=y), ";")).records
+    np.testing.assert_allclose(record.u[:, 0], U * 1e6)
+    np.testing.assert_allclose(record.y[:, 0], np.round(Y * 100, 1))
+
+
+def test_a_plain_space_may_part_two_numbers(tmp_path):
+    with pytest.raises(MampcError, match="received '5 000'"):
+        read(tmp_path, text(rows(u=[f"{value:.0f} 000" for value in U])))
+    u = [f"{value:.0f} 000{'.5' if k == 3 else ''}" for k, value in enumerate(U)]
+    [record] = read(tmp_path, text(rows(u=u))).records
+    np.testing.assert_allclose(record.u[:, 0], 1000 * U + 0.5 * (np.arange(len(U)) == 3))
+
+
+@pytest.mark.parametrize("confidence", ["0", "50"])
+def test_what_is_less_than_certain_is_not_used(tmp_path, confidence):
+    lines = [row if k != 5 else [*row[:4], confidence] for k, row in enumerate(QUALITY_100)]
+    export = read(tmp_path, text(lines, header=("time", "u", "u Confidence", "y", "y Confidence")))
+    assert [len(record) for record in export.records] == [5, 6]
+
+
+def test_a_product_quality_in_whole_numbers_can_be_said_to_be_none_of_others(tmp_path):
+    lines = [[*row, str(95 + k % 4)] for k, row in enumerate(rows())]
+    path = write(tmp_path, text(lines, header=("time", "u", "y", "Quality")))
+    with pytest.raises(MampcError, match=r"says nothing of others \(no_quality, --no-quality\)"):
+        read_export(path, inputs="u", outputs="y")
+    assert_whole(read_export(path, inputs="u", outputs="y", no_quality="Quality"))
+    seen = inspect_export(path, no_quality="Quality")
+    assert [column.name for column in seen.columns] == ["u", "y", "Quality"]
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_the_sample_time_is_that_of_the_columns_that_are_sampled(tmp_path, named):
+    lines = [[time, "y", str(y)] for time, y in zip(STAMPS, Y, strict=True)]
+    lines += [[STAMPS[k].replace(":00", ":17"), "u", str(U[k])] for k in (0, 3, 7, 9)]
+    path = write(tmp_path, text(lines, header=("time", "tag", "value")))
+    columns = {"inputs": "u", "outputs": "y"} if named else {}
+    seen = inspect_export(path, on_change="u", **columns)
+    assert (seen.dt, seen.doubts) == (60.0, ())
+    assert [len(column.values) for column in seen.columns] == [len(Y)] * 2
+
+
+def test_many_nines_are_a_mark(tmp_path):
+    y = [99999999.0 if k == 5 else value for k, value in enumerate(Y)]
+    export = read(tmp_path, text(rows(y=y)))
+    assert [len(record) for record in export.records] == [5, 6]
+    assert told(export, "1e+08")
