@@ -45,6 +45,7 @@ def test_a_study_runs_rivals_beside_each_other():
         ('method = "dead_band"', "size"),
         ('method = "dead_band"\nsettings = { size = 1.0, sise = 2.0 }', "expected settings among size, kind"),
         ('method = "penalised"\nsettings = { penalty = "l3" }', "penalty: expected one of l1"),
+        ('method = "penalised"\nsettings = { penalty = ["l1"] }', "penalty: expected one of l1"),
         ('method = "rounded"\nsettings = { step = 1.0 }\naround = "exact"', "rules for what a rule"),
         ('method = "mpc"\naround = "exact"', "around with the rules"),
     ],

@@ -69,7 +69,7 @@ def check_settings(method: str, settings: Mapping[str, Any]) -> None:
         raise MampcError(f"method: expected one of {', '.join(RIVALS)}, received {method!r}")
     if method == "penalised":
         name = settings.get("penalty")
-        if name not in PENALTIES:
+        if not isinstance(name, str) or name not in PENALTIES:
             raise MampcError(f"penalty: expected one of {', '.join(PENALTIES)}, received {name!r}")
         _require_known(f"{method}, {name}", PENALTIES[name], _apart(settings)[0])
     else:
