@@ -39,6 +39,16 @@ def test_the_tree_proves_no_more_than_the_table(seed, monkeypatch):
     holds(case_of(seed))
 
 
+# Conditions of 7e7 to 1e11; in some the relaxed programs of the tree have active limits and no digits to spare.
+@pytest.mark.parametrize("seed", [20287, 40355, 41311, 20031, 20072, 20391])
+def test_the_tree_proves_what_the_table_proves_where_normal_equations_have_no_digits(seed, monkeypatch):
+    case = case_of(seed, moves_limited=seed % 4 == 3)
+    assert decided(case).status is Status.OPTIMAL
+    monkeypatch.setattr(ranking, "LARGEST_TABLE", 0)
+    assert decided(case).status is Status.OPTIMAL
+    holds(case)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("moves_limited", [False, True])
 @pytest.mark.parametrize("seed", range(30, 400))
@@ -158,6 +168,13 @@ def test_refined_programs_are_optimal_whatever_bounds_they_start_from(seed):
         assert (np.abs(rows - at)[found.multipliers != 0] <= slack[found.multipliers != 0]).all()
         costs.append(np.sum((F @ found.z - c) ** 2))
     assert costs[0] == pytest.approx(costs[1], rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", [30622, 31397])
+def test_a_step_finds_a_plan_where_rounding_hides_the_multipliers(seed):
+    decision = decided(case_of(seed, moves_limited=seed % 4 == 3))
+    assert not decision.held
+    assert decision.gap > 0 or decision.status is Status.OPTIMAL
 
 
 def test_bounds_that_nothing_keeps_have_no_optimum():

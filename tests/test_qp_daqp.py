@@ -84,6 +84,15 @@ def test_crossed_bounds_are_bad_data_and_the_next_solve_is_right(program, data):
         assert solves_right(solver, data)
 
 
+@pytest.mark.parametrize("solve", ["solve", "solve_anew"])
+def test_equations_that_are_nearly_the_same_are_not_called_crossed_bounds(solve):
+    """A controller would take the first for a failure, and the second for a plan that cannot be."""
+    A = np.array([[1.0, 0.0], [1.0, 1e-7], [1.0, 1.0]])
+    b = A @ np.ones(2)
+    status = getattr(DaqpSolver(QuadraticProgram(np.eye(2), A, 0)), solve)(np.zeros(2), b, b).status
+    assert status in (QPStatus.OPTIMAL, QPStatus.FAILED)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_linear_term_that_is_not_finite_is_bad_data_and_the_next_solve_is_right(program, data, bad):
     f, lower, upper = data

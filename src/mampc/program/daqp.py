@@ -28,7 +28,10 @@ ORDINARY = 1e8  # length of f: up to here what daqp calls an optimum is one, and
 GONE = 1e18  # a bound beyond it is none, in whatever units
 EVEN = 5  # powers of two: units of variables and rows that are this near to even ones are left alone
 LONGEST = 1e3  # of an optimum in daqp's coordinates that its tolerance suits
+CROSSED = -1  # what an update says of bounds that cross
 _BAD_DATA = QPSolution(None, None, QPStatus.BAD_DATA, 0)
+# Bounds that leave one value each, of rows that are nearly parallel, are more than daqp can start from.
+_NOT_BEGUN = QPSolution(None, None, QPStatus.FAILED, 0)
 
 
 class DaqpSolver:
@@ -107,8 +110,7 @@ class DaqpSolver:
             changed["sense"] = _there(active, lower, upper)
         flag = model.update(**changed)
         if flag < 0:
-            self._local.model = None
-            return _BAD_DATA
+            return self._refused(flag)
         z, _, flag, info = model.solve()
         if flag > 0:
             solution = self._solution(z, info)
@@ -126,13 +128,18 @@ class DaqpSolver:
             self.start(active)
             return self.solve(f, lower, upper)
         sense = self._inactive if active is None else _there(active, lower, upper)
-        if model.update(f=f, blower=lower, bupper=upper, sense=sense) < 0:
-            self._local.model = None
-            return _BAD_DATA
+        flag = model.update(f=f, blower=lower, bupper=upper, sense=sense)
+        if flag < 0:
+            return self._refused(flag)
         z, _, flag, info = model.solve()
         if flag > 0:
             return QPSolution(z, info["lam"], QPStatus.OPTIMAL, info["iterations"])
         return self._failed(flag, info, f, lower, upper)
+
+    def _refused(self, flag: int) -> QPSolution:
+        """What is left to say of data that daqp did not take."""
+        self._local.model = None
+        return _BAD_DATA if flag == CROSSED else _NOT_BEGUN
 
     def _failed(self, flag: int, info: dict[str, Any], f: Array, lower: Array, upper: Array) -> QPSolution:
         """What is left to say of a program without an optimum that counts."""
@@ -155,8 +162,9 @@ class DaqpSolver:
     def _solve_scaled(self, f: Array, lower: Array, upper: Array, scale: float) -> QPSolution:
         """The same program in z / scale, which has the same H and A."""
         model = self._fresh_model()
-        if model.update(**self._changed(f / scale, lower / scale, upper / scale)) < 0:
-            return _BAD_DATA
+        flag = model.update(**self._changed(f / scale, lower / scale, upper / scale))
+        if flag < 0:
+            return _BAD_DATA if flag == CROSSED else _NOT_BEGUN
         z, _, flag, info = model.solve()
         if flag <= 0:
             return QPSolution(None, None, _STATUS.get(flag, QPStatus.FAILED), info["iterations"])

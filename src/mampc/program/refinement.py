@@ -19,6 +19,7 @@ from mampc.base.checks import Array
 
 BROKEN = 1e-11  # of the sizes in a row: a bound missed by more is not kept
 WRONG = 1e-11  # of the largest multiplier: one of the wrong sign by more is wrong
+NOISE = 1e-15  # of what a sum adds up: how far it may be from the truth
 DEPENDENT = 1e-12  # of a row's length: what others leave of it, when it says nothing new
 ROUNDS, ROUNDS_PER_VARIABLE = 100, 4  # until it is given up; each takes up one bound, or leaves one out
 
@@ -30,15 +31,33 @@ class Refined(NamedTuple):
     multipliers: Array
 
 
+class Cost(NamedTuple):
+    """|F z - c|^2, the triangular factor of F, its optimum without bounds, and how far that may be from the truth."""
+
+    F: Array
+    c: Array
+    factor: Array
+    optimum: Array
+    doubt: Array
+
+    @classmethod
+    def of(cls, F: Array, c: Array) -> Cost:
+        Q, factor = np.linalg.qr(F)
+        optimum = np.linalg.solve(factor, Q.T @ c)
+        optimum = optimum + np.linalg.solve(factor, Q.T @ (c - F @ optimum))
+        lost = NOISE * (np.abs(c) + np.abs(F) @ np.abs(optimum))
+        return cls(F, c, factor, optimum, np.abs(np.linalg.solve(factor, Q.T)) @ lost)
+
+
 def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array) -> Refined | None:
     """The optimum, from the active bounds that multipliers `pull` (rows,) tell; None if not found."""
     length = np.sqrt(np.square(A).sum(axis=1))
     length[length == 0] = 1.0
     A, low, high = A / length[:, None], low / length, high / length
     signs = {int(i): float(np.sign(pull[i])) for i in np.flatnonzero(pull)}
-    factor: Array = np.asarray(np.linalg.qr(F, mode="r"))
+    cost = Cost.of(F, c)
     for _ in range(ROUNDS + ROUNDS_PER_VARIABLE * len(F.T)):
-        solved = _at(F, c, A, low, high, signs)
+        solved = _at(cost, A, low, high, signs)
         if solved is None:
             return None
         z, u, signs = solved
@@ -57,7 +76,7 @@ def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array) 
                 multipliers[i] = sign * u[i]
             return Refined(z, multipliers / length)
         if not _taken_up(
-            factor, A, signs, u, worst, 1.0 if rows[worst] > high[worst] else -1.0, excess[worst]
+            cost.factor, A, signs, u, worst, 1.0 if rows[worst] > high[worst] else -1.0, excess[worst]
         ):
             return None
     return None
@@ -103,9 +122,10 @@ def _taken_up(
 
 
 def _at(
-    F: Array, c: Array, A: Array, low: Array, high: Array, signs: dict[int, float]
+    cost: Cost, A: Array, low: Array, high: Array, signs: dict[int, float]
 ) -> tuple[Array, dict[int, float], dict[int, float]] | None:
     """The optimum on active bounds, their multipliers (positive ones pull back), and those that say something new."""
+    F, c = cost.F, cost.c
     basis, kept = np.zeros((0, A.shape[1])), []
     for i in signs:
         rest = A[i] - (A[i] @ basis.T) @ basis
@@ -115,14 +135,40 @@ def _at(
             kept.append(i)
             basis = np.vstack([basis, rest / left])
     k = len(kept)
-    W, b = A[kept], np.array([high[i] if signs[i] > 0 else low[i] for i in kept])
+    sign = np.array([signs[i] for i in kept])
+    W, b = A[kept], np.where(sign > 0, high[kept], low[kept])
     Q, R = np.linalg.qr(W.T, mode="complete")
     z = Q[:, :k] @ np.linalg.solve(R[:k].T, b) if k else np.zeros(A.shape[1])
     if k < len(Q):
         Q2, R2 = np.linalg.qr(F @ Q[:, k:])
         z = z + Q[:, k:] @ np.linalg.solve(R2, Q2.T @ (c - F @ z))
-    pull = np.linalg.solve(R[:k], Q[:, :k].T @ (2 * F.T @ (c - F @ z))) if k else np.zeros(0)
+    pull: Array = np.zeros(0)
+    if k:
+        pull, noise = _pulls(cost, z, W, b, sign, np.linalg.solve(R[:k], Q[:, :k].T))
+        # One that rounding alone makes wrong is none: to leave out its bound gains less than rounding.
+        pull[(sign * pull < 0) & (sign * pull > -noise)] = 0.0
     if not (np.isfinite(z).all() and np.isfinite(pull).all()):
         return None
-    new = {i: signs[i] for i in kept}
-    return z, {i: new[i] * float(p) for i, p in zip(kept, pull, strict=True)}, new
+    return z, dict(zip(kept, (sign * pull).tolist(), strict=True)), {i: signs[i] for i in kept}
+
+
+def _pulls(cost: Cost, z: Array, W: Array, b: Array, sign: Array, inverse: Array) -> tuple[Array, Array]:
+    """Multipliers of W z = b at the optimum z there, and how far rounding leaves them from the truth.
+
+    They are what the gradient at z leaves, `inverse` being that of W', and what takes the optimum without bounds to z.
+    Where the first does not tell a sign, each is taken as the one of both tells it that knows it better.
+    """
+    F, c = cost.F, cost.c
+    pull = 2 * inverse @ (F.T @ (c - F @ z))
+    noise = 2 * NOISE * (np.abs(inverse) @ (np.abs(F.T) @ (np.abs(c) + np.abs(F) @ np.abs(z))))
+    if (sign * pull > noise).all():
+        return pull, noise
+    rows = np.linalg.qr(np.linalg.solve(cost.factor.T, W.T), mode="r")
+    if not (np.diag(rows) != 0).all():
+        return pull, noise
+    back = np.linalg.inv(rows)
+    back = 2 * (back @ back.T)
+    other = back @ (W @ cost.optimum - b)
+    of_other = np.abs(back) @ (np.abs(W) @ (cost.doubt + NOISE * np.abs(cost.optimum)) + NOISE * np.abs(b))
+    better = of_other < noise
+    return np.where(better, other, pull), np.where(better, of_other, noise)

@@ -22,6 +22,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.exact.zone_curvature import ZoneCurvature
+from mampc.program.least_distance import ROUNDING
 from mampc.program.qp import QPStatus
 from mampc.program.sample import Indices
 
@@ -62,7 +63,7 @@ class Branching:
         zoned = squares.condensed.bounds.zones is not None
         self._zones = ZoneCurvature(squares.condensed, squares.normal, order, sample) if zoned else None
         self._tried: set[bytes] = set()
-        self._failed: QPStatus | None = None  # how a program without an answer ended
+        self._out_of_time = False  # whether the last program was stopped by its time limit
 
     def run(self) -> float:
         """A lower bound over everything that was not visited: infinite when the search is complete."""
@@ -81,20 +82,21 @@ class Branching:
                 return bound
             heappop(heap)
             Z = self._without(Z, np.flatnonzero((state == OUT) & Z.any(axis=1)))
-            for child_bound, child in self._children(state, Z):
+            for child_bound, child in self._children(bound, state, Z):
                 number += 1
                 heappush(heap, (child_bound, number, child, Z))
-            if self._failed is QPStatus.TIME_LIMIT:
+            if self._out_of_time:
                 return bound
-            if self._failed is not None:  # what this node leads to stays unproven
-                problem.best.left(self._failed, bound)
-                self._failed = None
         return np.inf
 
-    def _children(self, state: Indices, Z: Array) -> list[tuple[float, Indices]]:
-        """What a node leads to, as far as it may beat the best plan, with bounds."""
+    def _children(self, bound: float, state: Indices, Z: Array) -> list[tuple[float, Indices]]:
+        """What a node, on which there is a bound, leads to, as far as it may beat the best plan, with bounds."""
         solved = self._solve(state, Z)
-        if solved is None or solved.bound >= self._problem.cutoff:
+        if solved is None:
+            return []
+        if isinstance(solved, QPStatus):
+            return self._split(bound, state)
+        if solved.bound >= self._problem.cutoff:
             return []
         gap = self._problem.cutoff - solved.bound
         made, out = solved.undecided & (solved.out >= gap), solved.undecided & (solved.made >= gap)
@@ -114,6 +116,20 @@ class Branching:
             child[i] = kind
             if solved.bound + adds < self._problem.cutoff and self._closed(child):
                 children.append((float(solved.bound + adds), child))
+        return children
+
+    def _split(self, bound: float, state: Indices) -> list[tuple[float, Indices]]:
+        """What a node leads to whose program has no answer though it may have one."""
+        open_ = np.flatnonzero(state == UNDECIDED)
+        if not len(open_):
+            self._problem.offer(self._problem.pattern(state == MADE))
+            return []
+        children = []
+        for kind in (OUT, MADE):
+            child = state.copy()
+            child[open_[0]] = kind
+            if self._closed(child):
+                children.append((bound, child))
         return children
 
     def _without(self, Z: Array, left_out: Indices) -> Array:
@@ -151,8 +167,8 @@ class Branching:
             state[open_] = OUT
         return used <= self._problem.allowance.left
 
-    def _solve(self, state: Indices, Z: Array) -> Solved | None:
-        """The node's program; None without an answer. A plan that it shows is tried."""
+    def _solve(self, state: Indices, Z: Array) -> Solved | QPStatus | None:
+        """The node's program; None if no moves keep the limits, its status without an answer. Plans shown are tried."""
         domain, of = self._problem.domain, self._of
         undecided, made = state == UNDECIDED, state == MADE
         within = state != OUT
@@ -165,13 +181,13 @@ class Branching:
         up, down = np.where(slope, domain.up, 0.0), np.where(slope, domain.down, 0.0)
         found = self._problem.relaxation.solve_priced(low, high, up, down)
         if not found.solved:
-            self._failed = None if found.infeasible else found.status
-            return None
+            self._out_of_time = found.status is QPStatus.TIME_LIMIT
+            return None if found.infeasible else found.status
         d = found.moves
         s = np.where(domain.bounded | ~within, found.pulls, 0.0)
         _, rest = self._problem.terms.priced(found, s)
         support = np.maximum(np.maximum(s * low, s * high), 0.0)
-        variance = np.einsum("iq,iq->i", Z, Z) if self._zones is None else self._zones.variance(d, within)
+        variance = self._variance(Z, d, within)
         out = d * d / np.where(variance > 0, variance, np.inf)
         if of.simultaneous:
             bound, adds = self._of_samples(rest, support, undecided, paid)
@@ -190,6 +206,21 @@ class Branching:
         return Solved(
             bound + raised, d, np.maximum(out - raised, 0.0), np.maximum(adds - raised, 0.0), undecided
         )
+
+    def _variance(self, Z: Array, d: Array, within: BoolArray) -> Array:
+        """The diagonal of the inverse curvature in the moves `within`, about moves d; zero for the others."""
+        squares = self._problem.squares
+        if self._zones is not None:
+            return self._zones.variance(d, within)
+        if not squares.orthogonal:
+            return np.asarray(np.einsum("iq,iq->i", Z, Z))
+        variance = np.zeros(len(d))
+        inverse = np.linalg.inv(np.linalg.qr(squares.L[:, :-1][:, within], mode="r"))
+        # No less than rounding leaves possible.
+        variance[within] = np.square(inverse).sum(axis=1) * (
+            1 + len(d) * ROUNDING * squares.condensed.condition
+        )
+        return variance
 
     def _of_moves(
         self, rest: float, s: Array, d: Array, variance: Array, undecided: BoolArray, made: BoolArray

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
-from mampc.methods.exact.nodes import Nodes, lift
+from mampc.methods.exact.nodes import Nodes, least_squares, lift, variance_of
 from mampc.methods.exact.terms import Squares, Terms
 from mampc.program.sample import Indices
 
@@ -106,20 +106,26 @@ def inverse_of(normal: Array) -> Array:
 def appraised(leaves: Leaves, squares: Squares, terms: Terms, columns: list[int]) -> Leaves:
     """The leaves bounded with these terms."""
     chosen = leaves.chosen
-    none, diagonal = chosen < 0, np.arange(chosen.shape[1])
-    normal = squares.normal[chosen[:, :, None], chosen[:, None, :]]
-    normal[:, diagonal, diagonal] += none
-    inverse = inverse_of(normal)
+    none: BoolArray = chosen < 0
     A = squares.L[:, chosen].transpose(1, 0, 2)
-    residual = np.repeat(terms.c[None, :, columns], len(chosen), axis=0)
-    d = np.zeros((*chosen.shape, len(columns)))
-    for _ in range(2 if squares.refined else 1):
-        step = inverse @ (A.transpose(0, 2, 1) @ residual)
-        d += step
-        residual -= A @ step
+    residual: Array = np.repeat(terms.c[None, :, columns], len(chosen), axis=0)
+    variance: Array
+    if squares.orthogonal:
+        d, root, residual = least_squares(A, residual, none)
+        variance = variance_of(root)
+    else:
+        diagonal = np.arange(chosen.shape[1])
+        normal = squares.normal[chosen[:, :, None], chosen[:, None, :]]
+        normal[:, diagonal, diagonal] += none
+        inverse = inverse_of(normal)
+        d = np.zeros((*chosen.shape, len(columns)))
+        for _ in range(2 if squares.refined else 1):
+            step = inverse @ (A.transpose(0, 2, 1) @ residual)
+            d += step
+            residual -= A @ step
+        variance = np.where(none, 0.0, np.diagonal(inverse, axis1=1, axis2=2))
     value = np.square(residual).sum(axis=1) + terms.rest[columns] + leaves.charge[:, None]
     if leaves.low.shape[1]:
-        variance = np.where(none, 0.0, np.diagonal(inverse, axis1=1, axis2=2))
         value += lift(leaves.low, leaves.high, d, variance)
         s = terms.s[:, columns][chosen]
         value -= np.maximum(s * leaves.low[:, :, None], s * leaves.high[:, :, None]).sum(axis=1)

@@ -209,6 +209,55 @@ def renewed(level: int, nodes: Nodes, columns: list[int], squares: Squares, term
     return nodes
 
 
+def worked_out(level: int, nodes: Nodes, squares: Squares, terms: Terms) -> Nodes:
+    """The nodes, which have decided `level` moves, worked out anew by a QR, which squares no condition.
+
+    What rounding makes of nodes by rows does not add up then.
+    """
+    free: BoolArray = np.asarray(nodes.root.any(axis=2))
+    none, known = ~free, (nodes.chosen >= 0) & ~free
+    fixed = np.where(known, nodes.d[:, :, 0], 0.0)
+    A = squares.L[:level][:, nodes.chosen].transpose(1, 0, 2)
+    c = terms.c[:level] - (A @ fixed[:, :, None])
+    d, inverse, residual = least_squares(np.where(free[:, None, :], A, 0.0), c, none)
+    q = nodes.root.shape[2]
+    columns = np.argsort(none, axis=1, kind="stable")[:, None, :q]
+    s, chosen = terms.s, nodes.chosen
+    if nodes.low.shape[1]:
+        support = np.maximum(s[chosen] * nodes.low[:, :, None], s[chosen] * nodes.high[:, :, None]).sum(
+            axis=1
+        )
+    else:
+        support = terms.support[chosen].sum(axis=1)
+    return nodes._replace(
+        d=d + fixed[:, :, None],
+        root=np.take_along_axis(inverse, columns, axis=2),
+        value=np.square(residual).sum(axis=1) + terms.rest - support,
+    )
+
+
+def least_squares(A: Array, c: Array, none: BoolArray) -> tuple[Array, Array, Array]:
+    """The optima of |A d - c|^2, the inverses of the triangular factors, and the residuals, by a QR.
+
+    Args:
+        A: shape (N, k, w), its columns `none` zero.
+        c: shape (N, k, K).
+        none: unknowns that are none, zero in the optima and in the inverses, shape (N, w).
+    """
+    N, k, w = A.shape
+    rows = np.zeros((N, k + w, w))
+    rows[:, :k] = A
+    diagonal = np.arange(w)
+    rows[:, k + diagonal, diagonal] = none
+    Q, R = np.linalg.qr(rows)
+    Q, across = Q[:, :k], Q[:, :k].transpose(0, 2, 1)
+    inverse = np.where(none[:, :, None], 0.0, np.linalg.inv(R))
+    reached = across @ c
+    residual = c - Q @ reached
+    lost = across @ residual  # what rounding left in the range
+    return inverse @ (reached + lost), inverse, residual - Q @ lost
+
+
 def variance_of(root: Array) -> Array:
     return np.asarray(np.einsum("nwq,nwq->nw", root, root))
 

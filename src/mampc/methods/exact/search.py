@@ -35,9 +35,6 @@ from mampc.program.qp import QPStatus
 from mampc.program.sample import Sample
 
 MOST_BESIDE_LEVELS = 1000  # patterns of inputs without levels that are tried one by one
-NORMAL_EQUATIONS = (
-    1e7  # condition of U from which on those that bound the nodes of the tree have no digits left
-)
 TOGETHER = 3  # patterns of the table whose limits are priced together
 
 
@@ -205,8 +202,6 @@ class ExactSearch:
 
     def _search_tree(self, sample: Sample, past: Allowance, solver: PatternSolver) -> Plan:
         best = Incumbent()
-        if self.condensed.condition > NORMAL_EQUATIONS:  # then the tree finds plans, and proves nothing
-            best.left(QPStatus.FAILED, sample.cost)
         open_bound = self._tree.search(sample, past, best, self._deadline(), solver)
         if open_bound < best.objective:
             return self._plan(sample, best, open_bound, Status.TIME_LIMIT)

@@ -30,6 +30,7 @@ from mampc.program.sample import Indices, Sample
 MOST_TERMS = 8  # that nodes are bounded with
 UNLIMITED = 1e15  # no limit of an input is as large
 UNEVEN = 1e4  # condition of U from which a step of refinement pays
+NORMAL_EQUATIONS = 1e7  # condition of U from which on normal equations have no digits left
 
 
 class Squares:
@@ -42,6 +43,7 @@ class Squares:
         normal: L' L, shape (n + 1, n + 1).
         curvature: its diagonal, shape (n,).
         refined: whether solutions of normal equations need a second step.
+        orthogonal: whether they have no digits left, so that every node is worked out anew by a QR.
     """
 
     def __init__(self, condensed: CondensedQP, order: Indices) -> None:
@@ -56,6 +58,7 @@ class Squares:
         self.curvature = np.diag(self.normal)[:n]
         self.inverse = np.linalg.inv(self.L[:, :n])
         self.refined = condensed.condition > UNEVEN
+        self.orthogonal = condensed.condition > NORMAL_EQUATIONS
 
     def at(self, sample: Sample) -> tuple[Array, float, Array]:
         """c, shape (n,), rest, and the free optimum, shape (n,)."""

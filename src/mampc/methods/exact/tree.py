@@ -22,7 +22,7 @@ from mampc.base.checks import Array, BoolArray
 from mampc.methods.exact.branching import Branching
 from mampc.methods.exact.children import children_of
 from mampc.methods.exact.leaves import Leaves, appraised, finished, with_one_more
-from mampc.methods.exact.nodes import Nodes, lift, renewed, root_of, trimmed, variance_of
+from mampc.methods.exact.nodes import Nodes, lift, renewed, root_of, trimmed, variance_of, worked_out
 from mampc.methods.exact.relaxation import Multipliers, Relaxation
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.exact.terms import Squares
@@ -202,7 +202,12 @@ class _BatchSearch:
                 continue
             children = self._growable(level, children)
             if len(children.bound):
-                children = self._bounded(level + 1, self._renewed(level + 1, trimmed(children), ids))
+                children = trimmed(children)
+                if self._squares.orthogonal:
+                    children = worked_out(level + 1, children, self._squares, self._terms)
+                else:
+                    children = self._renewed(level + 1, children, ids)
+                children = self._bounded(level + 1, children)
                 children = self._sharpened(level + 1, children.below(problem.cutoff)).below(problem.cutoff)
             if len(children.bound):
                 pending.append(_pending(level + 1, children, list(self._terms.ids)))
@@ -213,6 +218,8 @@ class _BatchSearch:
         now = self._terms.ids
         if ids == now:
             return nodes
+        if self._squares.orthogonal:
+            return worked_out(level, nodes, self._squares, self._terms)
         columns = [k for k in range(len(now)) if k >= len(ids) or ids[k] != now[k]]
         return renewed(level, nodes, columns, self._squares, self._terms)
 
@@ -276,7 +283,12 @@ class _BatchSearch:
         """Try the patterns of these nodes with no further move."""
         if not len(made.bound):
             return
-        leaves, _ = finished(level, trimmed(made), self._squares, self._terms)
+        made = trimmed(made)
+        if self._squares.orthogonal:
+            leaves = Leaves(made.chosen, made.charge, made.low, made.high, made.bound)
+            leaves = appraised(leaves, self._squares, self._terms, list(range(len(self._terms.ids))))
+        else:
+            leaves, _ = finished(level, made, self._squares, self._terms)
         self._try_all(leaves)
 
     def _try_last_moves(self, level: int, nodes: Nodes) -> None:
