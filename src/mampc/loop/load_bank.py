@@ -109,8 +109,7 @@ class LoadBank(Estimator):
         self._of_late, self._moved = self._moves(), slice(model.n_states, model.n_states + l)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         self._of_states, self._of_known = self._everyday()
-        size = self._of_known.shape[0] * self._of_states.shape[0] * self._of_states.shape[2]
-        self._together = None if size > SMALL else np.hstack([_diagonal(self._of_states), self._of_known])
+        self._together = _together(self._of_states, self._of_known)
 
     @classmethod
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
@@ -202,35 +201,34 @@ class LoadBank(Estimator):
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
-        bank = _bank(last)
-        known = np.concatenate((u, v_last, v, y, _ONE))
-        if not is_usable(known) or not is_usable(bank.members.ravel()):
-            return None
+        bank, l = _bank(last), len(y)
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
-        n_z, l = mixed.shape[1], len(y)
+        known = np.concatenate((mixed.ravel(), u, v_last, v, y, _ONE, bank.late))
+        if not is_usable(known):
+            return None
         if self._together is None:
-            each = np.matmul(self._of_states, mixed[:, :, None])[:, :, 0].ravel() + self._of_known.dot(known)
+            each = self._of_known.dot(known[mixed.size :])
+            each[: -len(bank.late)] += np.matmul(self._of_states, mixed[:, :, None]).ravel()
         else:
-            each = self._together.dot(np.concatenate((mixed.ravel(), known)))
+            each = self._together.dot(known)
         if not is_usable(each):
             return None
-        each = each.reshape(len(c), -1)
-        seen = c.dot(each[:, 2 * n_z : -l])  # innovation and movement of the mixture
-        late = self._of_late.dot(np.concatenate((bank.late, u)))
+        each, late = each[: -len(bank.late)].reshape(len(c), -1), each[-len(bank.late) :]
+        seen = c.dot(each[:, 2 * mixed.shape[1] : -l])  # innovation and movement of the mixture
         estimate = self._weighed(*self._split(each), late, c, bank, self._everything)
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
         """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
         bank = _bank(last)
-        known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1))), axis=1)
+        known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1)), bank.late), axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
             c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
-            n_z, l, hypotheses = mixed.shape[2], y.shape[1], len(self.members)
-            each = np.matmul(self._of_states, mixed[..., None])[..., 0]
-            each += (known @ self._of_known.T).reshape(len(y), hypotheses, -1)
+            n_z, l, n_late = mixed.shape[2], y.shape[1], bank.late.shape[1]
+            of_known = known @ self._of_known.T
+            each, late = of_known[:, :-n_late].reshape(len(y), len(self.members), -1), of_known[:, -n_late:]
+            each += np.matmul(self._of_states, mixed[..., None])[..., 0]
             seen = np.einsum("sb,sbi->si", c, each[:, :, 2 * n_z : -l])
-            late = np.concatenate((bank.late, u), axis=1) @ self._of_late.T
             estimate = self._weighed(*self._split(each), late, c, bank, self._everything)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
@@ -240,13 +238,15 @@ class LoadBank(Estimator):
         return each[..., :n_z], each[..., n_z : 2 * n_z], each[..., -l:]
 
     def _everyday(self) -> tuple[Array, Array]:
-        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1) to all that `update` needs.
+        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1, late) to all that `update` needs.
 
         For each hypothesis: z predicted, its correction, innovation, movement of the outputs, innovation made white.
+        And behind these, of what is known alone, the next `late`.
         """
         model = self.model
         n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
-        u, v_last, v, y, one = np.split(np.eye(m + 2 * d + l + 1), np.cumsum([m, d, d, l]))
+        sizes = (m, d, d, l, 1, len(self._of_late))
+        u, v_last, v, y, one, late = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
         op = np.outer(model.all_inputs_op, one)
         drive = model.B @ (np.vstack([u, v_last]) - op)
         surplus = y - np.outer(model.y_op, one) - model.D @ (np.vstack([u, v]) - op)
@@ -259,7 +259,7 @@ class LoadBank(Estimator):
             seen = -C @ A
             of_states.append(np.vstack([A, K @ seen, seen, moved, W @ seen]))
             of_known.append(np.vstack([driven, K @ innovation, innovation, model.C @ drive, W @ innovation]))
-        return np.stack(of_states), np.vstack(of_known)
+        return np.stack(of_states), np.vstack([*of_known, self._of_late @ np.vstack([late, u])])
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since."""
@@ -373,12 +373,17 @@ class LoadBank(Estimator):
         return change
 
 
-def _diagonal(blocks: Array) -> Array:
-    """Blocks (B, rows, columns) along the diagonal of one matrix."""
+def _together(blocks: Array, beside: Array) -> Array | None:
+    """Blocks (B, rows, columns) along the diagonal of one matrix, and beside them another one; None if not small."""
     count, rows, columns = blocks.shape
-    matrix = np.zeros((count, rows, count, columns))
-    matrix[np.arange(count), :, np.arange(count)] = blocks
-    return matrix.reshape(count * rows, count * columns)
+    if len(beside) * count * columns > SMALL:
+        return None
+    diagonal = np.zeros((count, rows, count, columns))
+    diagonal[np.arange(count), :, np.arange(count)] = blocks
+    matrix = np.zeros((len(beside), count * columns + beside.shape[1]))
+    matrix[: count * rows, : count * columns] = diagonal.reshape(count * rows, count * columns)
+    matrix[:, count * columns :] = beside
+    return matrix
 
 
 def _bank(estimate: Estimate) -> BankEstimate:

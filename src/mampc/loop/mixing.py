@@ -81,7 +81,7 @@ class Mixing:
         self.chances, returns = _chances(jumps)
         self.lasts = np.where(jumps & ~jumps.all(), 0.0, 1.0)
         self._returns, self._ones = returns[:, None], np.ones(len(jumps))
-        self._least = np.full(len(jumps), LEAST)
+        self._least, self._remembered = LEAST * self.lasts, FORGETS * self.lasts
 
     def before(self, weights: Array, usual: Array, members: Array) -> tuple[Array, Array]:
         """How likely each hypothesis is now, before the measurement, (..., B); and where its filter starts."""
@@ -124,7 +124,7 @@ class Mixing:
         likelihood = log_scale - surprise * (0.5 / variance)
         weights = c * np.exp(likelihood - likelihood[likelihood.argmax()])
         weights *= 1 / weights.dot(self._ones)
-        usual = np.maximum(usual * (1 - FORGETS) + weights * FORGETS, self._least) * self.lasts
+        usual = np.maximum(usual * (1 - FORGETS) + weights * self._remembered, self._least)
         usual *= 1 / usual.dot(self._ones)
         if not believed:
             return weights, usual, scale

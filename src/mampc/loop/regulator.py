@@ -118,6 +118,9 @@ class Regulator:
             raise MampcError("price_follows_noise: expected value_of_information=True beside it")
         if self.value_of_information:
             self._planner = _with_information(self._planner, self.estimator, self.price_follows_noise)
+        self._counts_on_data = any(
+            isinstance(one, MAMPC) and one.information is not None for one in self._planner.each
+        )
 
     def __repr__(self) -> str:
         counts = ", value_of_information=True" if self.value_of_information else ""
@@ -266,7 +269,7 @@ class Regulator:
             measured_disturbance=v,
             limits=limits,
             manual=manual,
-            hypotheses=self.estimator.weights_of(estimate),
+            hypotheses=self.estimator.weights_of(estimate) if self._counts_on_data else None,
             **chosen,
         )
         command, positions, memory = None, decision.u, decision.state
