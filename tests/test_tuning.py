@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 import mampc
 from builders import tank_model
 from mampc.cli import app
-from mampc.compare import candidates, scenarios, tuning
+from mampc.compare import candidates, promise, scenarios, tuning
+from mampc.compare.fronts import Point
 from mampc.compare.scenarios import even_weight, scenario_length, settling, usual_problem
 from mampc.compare.tuned_study import study_of_model, with_tuning
 from mampc.program.condensing import CondensedQP
@@ -19,16 +20,14 @@ from mampc.study.regulators import regulator_of
 from mampc.study.running import run_study
 from mampc.study.writing import study_text
 
-SMALL = {
-    "SEARCHED": 3, "REFINED": 4, "CONFIRMED": 8, "SEARCH_PRICES": 3, "REFINE_PRICES": 4,
-}  # fmt: skip
+SMALL = tuning.Rounds(3, 3, 4, 4, 8)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_and_short():
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in SMALL.items():
-            patch.setattr(tuning, name, value)
+        for name in ("ROUNDS", "DEAR_ROUNDS"):
+            patch.setattr(tuning, name, SMALL)
         patch.setattr(candidates, "MOVE_WEIGHTS", (0.1,))
         patch.setattr(scenarios, "LENGTHS", (80, 80))
         yield
@@ -59,7 +58,7 @@ def test_the_promise_is_kept_as_a_mean_on_plants_that_were_not_seen(tank):
     model = tank_model()
     assert tank.reached
     expected = tank.expected
-    assert expected.error_ratio.value + 0.5 * expected.error_ratio.standard_error <= 1.25
+    assert expected.error_ratio.value + expected.error_ratio.standard_error <= 1.25
     assert expected.moves_per_hour.value < 0.2 * expected.plain_moves_per_hour.value
     seeds = range(1000, 1012)
     plants = [mampc.Mismatch(gain=0.15, lag=0.15, dead_time=0.15).drawn(model, seed) for seed in seeds]
@@ -75,6 +74,56 @@ def test_the_promise_is_kept_as_a_mean_on_plants_that_were_not_seen(tank):
     assert ratio - 2 * spread <= 1.25
 
 
+def in_turn(*errors):
+    """A setting with these errors under kinds of load in turn, in eight scenarios each, and plain MPC with 1."""
+    errors = np.tile(errors, 8)
+    return Point("", 1.0, errors + 3.0, errors), Point(
+        "", 0.0, np.full(len(errors), 9.0), np.ones(len(errors))
+    )
+
+
+def test_kinds_of_load_count_alike_and_a_better_one_makes_up_for_no_other():
+    point, base = in_turn(0.0, 3.0)
+    assert promise.error_ratio(point, base, 2).value == pytest.approx(2.0)
+    assert promise.error_ratio(point, base).value == pytest.approx(1.5)
+    large = Point("", 1.0, point.moves, point.error * np.tile([1.0, 100.0], 8))
+    under = Point("", 0.0, base.moves, np.tile([1.0, 100.0], 8))
+    assert promise.error_ratio(large, under, 2).value == pytest.approx(2.0)
+
+
+def test_a_kind_of_load_with_more_error_than_allowed_is_named():
+    goal, kinds = promise.Goal(0.25, None, hours=1.0), [(mampc.loads.RandomWalk(size=1.0),), ()]
+    text = str(promise.Expected.of(*in_turn(1.4, 0.9), goal, kinds))
+    assert "Under random walk alone the error is larger than the 1.25 times allowed" in text
+    assert "no load 0.90" in text
+    assert "alone" not in str(promise.Expected.of(*in_turn(1.2, 1.1), goal, kinds))
+
+
+@pytest.mark.parametrize("falls", [False, True])
+def test_the_price_aimed_at_is_the_highest_that_keeps_the_allowance_or_one_beyond_a_swing(falls):
+    """Cheap moves may drive a plant off its model to and fro, so that errors fall with the price."""
+    base = in_turn(1.0)[1]
+    errors = [3.0, 2.0, 1.1] if falls else [1.0, 1.1, 2.0]
+    points = [Point("", 10.0**k, np.full(8, 8.0 / 2**k), np.full(8, error)) for k, error in enumerate(errors)]
+    worth, price = promise.Goal(0.25, None).at_aim(points, base)
+    assert price == pytest.approx(100.0) if falls else 10.0 < price < 100.0
+    assert worth <= np.log(4.0)
+
+
+def test_the_price_is_the_one_nearest_to_what_is_allowed():
+    class Line:
+        def points(self, prices, scenarios):
+            return [Point("", price, np.ones(8), np.full(8, price)) for price in prices]
+
+    base, goal = in_turn(1.0)[1], promise.Goal(0.25, None)
+    for begun in (0.5, 1.1, 1.2, 3.0):
+        work = tuning.Work(SMALL, 1, False, lambda *_: None)
+        price, _, kept = tuning._nearest(goal, begun, Line(), range(8), base, work)
+        assert kept
+        assert price <= 1.25
+        assert price > 1.0 or begun == 0.5  # a few steps up at most
+
+
 def test_what_is_found_can_be_used_at_other_prices(tank):
     assert tank.regulator.controller.rules == tank.rules
     assert tank.rules.price > 0
@@ -87,13 +136,19 @@ def test_what_is_found_can_be_used_at_other_prices(tank):
     assert "means over 8 scenarios" in str(tank.expected)
     ratios = [ratio.value for ratio in tank.expected.by_load]
     assert len(ratios) == len(tank.loads)
-    assert min(ratios) <= tank.expected.error_ratio.value <= max(ratios)
-    assert f"by kind of load {min(ratios):.2f} to {max(ratios):.2f}" in str(tank.expected)
+    assert tank.expected.error_ratio.value == pytest.approx(np.mean(np.maximum(ratios, 1.0)))
+    assert f"random steps {ratios[0]:.2f}, random walk {ratios[1]:.2f}" in str(tank.expected)
     assert "standard error" in str(tank.expected)
 
 
-def test_a_seed_decides_everything():
-    a, b, c = (tuned(lag(), seed=seed) for seed in (3, 3, 4))
+def test_a_seed_decides_everything_and_progress_counts_closed_loops_up_to_all_of_them():
+    seen = []
+    a, c = (tuned(lag(), seed=seed) for seed in (3, 4))
+    b = tuned(lag(), seed=3, on_task=lambda *counts: seen.append(counts))
+    done = [count for count, _ in seen]
+    assert done == sorted(done)
+    assert seen[-1][0] == seen[-1][1]
+    assert len(seen) > 6
     assert a.rules == b.rules
     assert a.rows == b.rows
     assert a.expected == b.expected
@@ -164,12 +219,12 @@ def test_moves_per_hour_can_be_asked_for():
     found = tuned(lag(), max_moves_per_hour=40.0)
     assert found.reached
     moves = found.expected.moves_per_hour
-    assert moves.value + 0.5 * moves.standard_error <= 40
+    assert moves.value + moves.standard_error <= 40
 
 
 def test_what_cannot_be_reached_is_told_and_the_calmest_is_given(monkeypatch):
     monkeypatch.setattr(tuning, "SEARCH_SPAN", (1e-3, 1e-2))
-    monkeypatch.setattr(tuning, "TRIES", 2)
+    monkeypatch.setattr(tuning, "STEPS", (1, 2))
     found = tuned(lag(), max_moves_per_hour=1e-3)
     assert not found.reached
     assert found.expected.moves_per_hour.value < found.expected.plain_moves_per_hour.value
@@ -177,7 +232,8 @@ def test_what_cannot_be_reached_is_told_and_the_calmest_is_given(monkeypatch):
 
 
 def test_where_nothing_keeps_the_allowance_plain_mpc_stays(monkeypatch):
-    monkeypatch.setattr(tuning, "TRIES", 0)
+    monkeypatch.setattr(promise.Goal, "keeps", lambda *_: False)
+    monkeypatch.setattr(tuning, "STEPS", (1,))
     found = tuned(lag())
     assert not found.reached
     assert found.rules.price == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -41,17 +42,17 @@ def progress() -> Iterator[Any]:
 
 
 @contextmanager
-def bar(title: str) -> Iterator[Any]:
+def bar(title: str, unit: str = "settings") -> Iterator[Any]:
     """A function that shows how many of all tasks are done, with the time left; a line now and then elsewhere."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True, highlight=False, markup=False)
     if not console.is_terminal:
-        shown = [0]
+        shown, began = [0], time.perf_counter()
 
         def tell(done: int, total: int) -> None:
             if done >= shown[0] or done == total:
-                complain(f"{done} of {total} settings done")
+                complain(f"{done} of {total} {unit} done{_left(time.perf_counter() - began, done, total)}")
                 shown[0] = done + max(1, total // 5)
 
         yield tell
@@ -60,3 +61,10 @@ def bar(title: str) -> Iterator[Any]:
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(title)
         yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def _left(seconds: float, done: int, total: int) -> str:
+    """The time left, once it can be told."""
+    if seconds < 2 or not 0 < done < total:
+        return ""
+    return f", about {seconds * (total - done) / done:.0f} s left"

@@ -89,7 +89,7 @@ def tune(
             prepared = prepare(study, show)
         model, given = prepared.model, told_by(study, prepared)
     made_folder(folder)  # what cannot be written is said before the work
-    with bar(source) as tell:
+    with bar(source, "closed loops") as tell:
         tuned = search(model, **goal, **given, seed=seed, jobs=jobs, progress=False, on_task=tell)
     base = study_of_model(model, tuned, Path(source).stem[:80]) if study is None else study
     note = write_tuning(

@@ -18,8 +18,8 @@ from mampc.loop.regulator import Regulator
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import TrackingProblem
 
-MOVE_WEIGHTS = (0.1, 0.3)  # times those of plain MPC
-TAILS = (0.0, 0.25, 1.0)  # times the prediction horizon
+MOVE_WEIGHTS = (0.1, 0.3, 1.0)  # times those of plain MPC
+TAILS = (0.0, 0.25)  # times the prediction horizon
 PULLS = (0.0, 0.1)  # to the middle of zones, where plain MPC has none
 CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
 MOST_MOVES = 9  # of all inputs together, within these, which keeps the patterns to a few hundred

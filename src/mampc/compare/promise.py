@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from mampc.base.checks import Array, as_number
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, listed
 from mampc.compare.fronts import FEWEST, Estimate, Point
+from mampc.loop.loads import Load
 
 AIM = 0.9  # share of the allowance that the first two rounds aim at
 BACK = 0.8  # factor of the price where a confirmation fails
+FEWEST_LOOPS = 2  # of one kind of load, below which kinds are not told apart
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,7 @@ class Goal:
     max_error_increase: float | None
     max_moves_per_hour: float | None
     hours: float = field(default=0.0, kw_only=True)
+    kinds: int = field(default=1, kw_only=True)
 
     @classmethod
     def asked(cls, max_error_increase: float | None, max_moves_per_hour: float | None) -> Goal:
@@ -36,7 +40,7 @@ class Goal:
     def used(self, point: Point, baseline: Point) -> Estimate:
         """The share of what is allowed that a setting uses, 1 for all of it."""
         if self.max_error_increase is not None:
-            ratio = error_ratio(point, baseline)
+            ratio = error_ratio(point, baseline, self.kinds)
             return Estimate(
                 (ratio.value - 1) / self.max_error_increase, ratio.standard_error / self.max_error_increase
             )
@@ -47,20 +51,31 @@ class Goal:
     def at_aim(self, points: Sequence[Point], baseline: Point) -> tuple[float, float]:
         """How good a candidate is where it uses `AIM` of what is allowed, lower being better, and the price there.
 
-        Infinite where no price uses so little.
+        Errors need not rise with the price: where plants are off the model, cheap moves can drive them to and fro.
+        Infinite where no price uses so little; then with the price that uses least.
         """
-        order = sorted(points, key=lambda point: point.value)
+        by_error = self.max_error_increase is not None
+        order = sorted(points, key=lambda point: point.value, reverse=not by_error)  # towards what uses more
         used = np.array([self.used(point, baseline).value for point in order])
-        if self.max_error_increase is not None:  # a higher price uses more of it
-            used = np.maximum.accumulate(used)
+        logs = np.log([point.value for point in order])
+        if by_error:
             worth = np.log([max(point.moves.mean(), FEWEST) for point in order])
         else:
-            used, order = np.maximum.accumulate(used[::-1]), order[::-1]
             worth = np.log([max(point.error.mean(), 1e-300) for point in order])
-        logs = np.log([point.value for point in order])
-        if used[0] > AIM:
-            return np.inf, float(np.exp(logs[0]))
-        return float(np.interp(AIM, used, worth)), float(np.exp(np.interp(AIM, used, logs)))
+        if used.min() > AIM:
+            return np.inf, float(np.exp(logs[used.argmin()]))
+        best = int(np.where(used <= AIM, worth, np.inf).argmin())
+        further = best + 1
+        if further == len(order) or used[further] <= AIM or not np.isfinite(worth[further]):
+            return float(worth[best]), float(np.exp(logs[best]))
+        share = (AIM - used[best]) / (used[further] - used[best])
+        at = [float(line[best] + share * (line[further] - line[best])) for line in (worth, logs)]
+        return at[0], float(np.exp(at[1]))
+
+    def keeps(self, point: Point, baseline: Point) -> bool:
+        """Whether the mean plus one standard error is within what is allowed."""
+        used = self.used(point, baseline)
+        return bool(used.value + np.nan_to_num(used.standard_error) <= 1)
 
     @property
     def back(self) -> float:
@@ -68,8 +83,25 @@ class Goal:
         return BACK if self.max_error_increase is not None else 1 / BACK
 
 
-def error_ratio(point: Point, baseline: Point) -> Estimate:
-    """Mean error over that of plain MPC in the same loops, with the standard error of this ratio of means."""
+def error_ratio(point: Point, baseline: Point, kinds: int = 1) -> Estimate:
+    """The error over that of plain MPC in the same loops, a mean over the kinds of load that loops take in turn.
+
+    A kind under which it is below 1 counts as 1, so that it makes up for no other.
+    """
+    ratios = by_kind(point, baseline, kinds) or (_ratio_of_means(point, baseline),)
+    value = float(np.mean([max(ratio.value, 1.0) for ratio in ratios]))
+    return Estimate(value, float(np.linalg.norm([ratio.standard_error for ratio in ratios]) / len(ratios)))
+
+
+def by_kind(point: Point, baseline: Point, kinds: int) -> tuple[Estimate, ...]:
+    """Mean error over that of plain MPC under each kind of load; none where a kind has too few loops."""
+    if len(point.error) < FEWEST_LOOPS * kinds:
+        return ()
+    return tuple(_ratio_of_means(_part(point, k, kinds), _part(baseline, k, kinds)) for k in range(kinds))
+
+
+def _ratio_of_means(point: Point, baseline: Point) -> Estimate:
+    """Mean error over that of plain MPC, with the standard error of this ratio."""
     mean = float(baseline.error.mean())
     ratio = float(point.error.mean()) / mean
     if not np.isfinite(ratio):
@@ -96,39 +128,58 @@ class Expected:
 
     Attributes:
         moves_per_hour: of all inputs together.
-        error_ratio: mean tracking error over that of plain MPC in the same scenarios.
+        error_ratio: tracking error over that of plain MPC in the same scenarios, a mean over the kinds of load; a kind
+            that comes out below 1 counts as 1.
         plain_moves_per_hour: of plain MPC.
         scenarios: how many they are means over.
-        by_load: error ratios under each kind of load, in the order of `Tuned.loads`; the promise is about their mean.
-            Empty where a kind has fewer than two scenarios.
+        loads: the kinds of load in words.
+        by_load: error ratios under each of them; empty where a kind has fewer than two scenarios.
+        allowed: the error ratio asked for; None where moves per hour were.
     """
 
     moves_per_hour: Estimate
     error_ratio: Estimate
     plain_moves_per_hour: Estimate
     scenarios: int
+    loads: tuple[str, ...] = ()
     by_load: tuple[Estimate, ...] = ()
+    allowed: float | None = None
 
     @classmethod
-    def of(cls, point: Point, baseline: Point, hours: float, kinds: int) -> Expected:
-        """From runs in scenarios of this length, which take so many kinds of load in turn."""
-        enough = kinds if len(point.error) >= 2 * kinds else 0
-        parts = [(_part(point, k, kinds), _part(baseline, k, kinds)) for k in range(enough)]
+    def of(cls, point: Point, baseline: Point, goal: Goal, loads: Sequence[Sequence[Load]]) -> Expected:
+        """From runs in scenarios, which take these kinds of load in turn."""
+        allowed = None if goal.max_error_increase is None else 1 + goal.max_error_increase
         return cls(
-            moves_per_hour(point, hours), error_ratio(point, baseline), moves_per_hour(baseline, hours),
-            len(point.error), tuple(error_ratio(*part) for part in parts),
+            moves_per_hour(point, goal.hours), error_ratio(point, baseline, len(loads)),
+            moves_per_hour(baseline, goal.hours), len(point.error), tuple(map(in_words, loads)),
+            by_kind(point, baseline, len(loads)), allowed,
         )  # fmt: skip
 
     def __str__(self) -> str:
         moves, error, plain = self.moves_per_hour, self.error_ratio, self.plain_moves_per_hour
-        ratios = [ratio.value for ratio in self.by_load]
-        each = f"; by kind of load {min(ratios):.2f} to {max(ratios):.2f}" if len(ratios) > 1 else ""
-        return (
+        over = f"{self.scenarios} scenarios"
+        kinds = list(zip(self.loads, self.by_load, strict=True)) if len(self.by_load) > 1 else []
+        text = (
             f"{_short(moves.value)} moves per hour (standard error {_short(moves.standard_error)}; plain MPC "
             f"{_short(plain.value)}) at {error.value:.3f} times the error of plain MPC (standard error "
-            f"{error.standard_error:.2g}): means over {self.scenarios} scenarios, from which a single run may "
-            f"differ{each}"
+            f"{error.standard_error:.2g}): means over {over}, from which a single run may differ"
         )
+        if kinds:
+            each = ", ".join(f"{name} {ratio.value:.2f}" for name, ratio in kinds)
+            text += f". By kind of load, which count alike: {each}"
+            above = [name for name, ratio in kinds if self.allowed and ratio.value > self.allowed]
+            if above:
+                text += (
+                    f". Under {listed(above)} alone the error is larger than the {self.allowed:g} times allowed: "
+                    "where your plant has no other loads, tell tune which it has"
+                )
+        return text
+
+
+def in_words(kind: Sequence[Load]) -> str:
+    """A kind of load, such as "random walk and steps"."""
+    names = [re.sub(r"(?<!^)(?=[A-Z])", " ", type(load).__name__).lower() for load in kind]
+    return " and ".join(names) or "no load"
 
 
 def _part(point: Point, kind: int, kinds: int) -> Point:

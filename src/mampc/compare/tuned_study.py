@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import LARGEST, Array
+from mampc.compare.promise import in_words
 from mampc.compare.scenarios import CHANGE, CHANGES, STAND_IN, scenario_length
 from mampc.compare.sweep import BASELINE
 from mampc.compare.tuning import Tuned
@@ -67,7 +67,7 @@ def study_of_model(model: StateSpace, tuned: Tuned, name: str) -> Study:
     ]
     scenarios = [
         ScenarioTable(
-            name=_name(kind), noise=tuned.noise.tolist(), seed=number, loads=[_table(load) for load in kind],
+            name=in_words(kind), noise=tuned.noise.tolist(), seed=number, loads=[_table(load) for load in kind],
             mismatch=MismatchTable(**vars(STAND_IN)),
         )
         for number, kind in enumerate(tuned.loads)
@@ -104,14 +104,6 @@ def with_tuning(study: Study, tuned: Tuned) -> Study:
 
 def _levels(study: Study, outputs: int) -> list[list[float]]:
     return [np.broadcast_to(change.value, outputs).tolist() for change in study.reference.changes]
-
-
-def _name(kind: Sequence[Load]) -> str:
-    return " and ".join(_words(type(load)) for load in kind) or "no load"
-
-
-def _words(kind: type) -> str:
-    return next(name for name, known in LOADS.items() if known is kind).replace("_", " ")
 
 
 def _table(load: Load) -> LoadTable:
