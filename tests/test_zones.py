@@ -10,7 +10,8 @@ import pytest
 import mampc
 from builders import cost_of, distance, predicted, random_model
 from mampc import Status
-from mampc.methods.exact import zone_search
+from mampc.methods import local_search
+from mampc.methods.exact import relaxation, sample_problem, search, zone_search
 from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.exact.terms import Squares
@@ -18,6 +19,7 @@ from mampc.methods.exact.zone_search import single_moves
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.condensing import CondensedQP
+from mampc.program.least_distance import LeastDistance
 from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
 
 INF = np.inf
@@ -139,6 +141,30 @@ def test_single_moves_are_tried_no_longer_than_there_is_time(monkeypatch):
     assert decision.status is Status.TIME_LIMIT
     assert decision.lower_bound <= decision.objective
     assert len(tried) == 4
+
+
+@pytest.mark.parametrize("limit", [1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0])
+def test_no_program_begins_after_the_time_limit(limit, monkeypatch):
+    """On a clock that each program puts on by one: those in a row check it as often as they are solved."""
+    now, bounds, solve_at = [0.0], [], LeastDistance.solve_at
+
+    def solved(*of):
+        now[0] += 1.0
+        return solve_at(*of)
+
+    for module in (local_search, relaxation, sample_problem, search):
+        monkeypatch.setattr(module, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(LeastDistance, "solve_at", solved)
+    for seed in range(6):
+        problem, x, reference, _ = random_problem(seed, control_horizon=6)
+        rules = mampc.MoveRules(price=0.05, max_moves=4)
+        controller = mampc.MAMPC(problem, rules, method=mampc.Exact(time_limit=limit))
+        now[0] = 0.0
+        decision = controller.step(controller.initial_state(), x, reference)
+        assert now[0] <= limit
+        assert decision.lower_bound <= decision.objective
+        bounds.append(decision.status is Status.TIME_LIMIT)
+    assert any(bounds) or limit > 6
 
 
 def test_the_exact_optimum_is_that_of_scip():

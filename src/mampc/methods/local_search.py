@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import suppress
+from time import perf_counter
 
 import numpy as np
 
@@ -99,11 +100,16 @@ class LocalSearch:
         best: Incumbent,
         deadline: float = np.inf,
     ) -> None:
-        """Offer the plans of a local search, as `patterns` proposes them, to the incumbent."""
+        """Offer the plans of a local search, as `patterns` proposes them, to the incumbent.
+
+        After the deadline, of `perf_counter`, none where there is a plan.
+        """
         patterns, solved = self.patterns(sample, f, past), None
         with suppress(StopIteration):
             while True:
                 pattern = next(patterns) if solved is None else patterns.send(solved)
+                if best.moves is not None and perf_counter() > deadline:
+                    return
                 solved = solver.offer(sample, pattern, best, deadline)
 
     def patterns(self, sample: Sample, f: Array, past: Allowance) -> Generator[BoolArray, OnPattern, int]:

@@ -63,7 +63,9 @@ class Branching:
         zoned = squares.condensed.bounds.zones is not None
         self._zones = ZoneCurvature(squares.condensed, squares.normal, order, sample) if zoned else None
         self._tried: set[bytes] = set()
-        self._out_of_time = False  # whether the last program was stopped by its time limit
+        self._out_of_time = (
+            False  # whether the last node's program, or a plan that it shows, had no time left
+        )
 
     def run(self) -> float:
         """A lower bound over everything that was not visited: infinite when the search is complete."""
@@ -92,7 +94,7 @@ class Branching:
     def _children(self, bound: float, state: Indices, Z: Array) -> list[tuple[float, Indices]]:
         """What a node, on which there is a bound, leads to, as far as it may beat the best plan, with bounds."""
         solved = self._solve(state, Z)
-        if solved is None:
+        if solved is None or self._out_of_time:
             return []
         if isinstance(solved, QPStatus):
             return self._split(bound, state)
@@ -265,6 +267,9 @@ class Branching:
         problem, pattern = self._problem, self._problem.moving(moves)
         key, charge = pattern.tobytes(), self._of.charge(pattern)
         if key in self._tried or cost + charge >= problem.best.objective:
+            return
+        if problem.late and problem.best.moves is not None:
+            self._out_of_time = True
             return
         self._tried.add(key)
         if not self._of.allows(pattern, problem.allowance):

@@ -29,6 +29,8 @@ def search_zones(problem: SampleProblem, solver: PatternSolver, local: LocalSear
     if problem.terms.rest[0] >= problem.cutoff:
         return np.inf
     sample, condensed = problem.sample, problem.squares.condensed
+    if problem.late:
+        return float(problem.terms.rest[0])
     free = condensed.plain.solve(sample.moves, sample.lower, sample.upper)
     if free.multipliers is None:
         return Branching(problem).run()
@@ -36,6 +38,8 @@ def search_zones(problem: SampleProblem, solver: PatternSolver, local: LocalSear
     if not _are_few(problem, least):
         f, _ = condensed.relaxed_limits(sample, free.multipliers)
         local.offer(solver, sample, f, problem.allowance, problem.best, problem.deadline)
+        if problem.late:
+            return least
         if not _are_few(problem, least):
             return Branching(problem).run()
     if _most_moves(problem, least) < 1:
