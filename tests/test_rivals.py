@@ -286,6 +286,19 @@ def test_rounded_inputs_are_on_the_grid_and_hysteresis_saves_moves():
     assert np.count_nonzero(np.diff(patient, axis=0)) < np.count_nonzero(np.diff(plain, axis=0))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_slower_sampling_plans_moves_at_its_own_samples_only(seed):
+    problem, x, reference, u = random_problem(seed, limits=mampc.Limits())
+    controller = rivals.Periodic(mampc.MPC(problem), every=2)
+    decision = controller.step(controller.initial_state(u), x, reference)
+    condensed, due = controller.condensed, np.array([0, 1, 4, 5])  # of four samples with two inputs
+    sample = condensed.sample(condensed.parameter.vector(x, u, reference), u)
+    best = np.linalg.lstsq(condensed.U[:, due], sample.target, rcond=None)[0]
+    np.testing.assert_allclose(decision.u - u, best[:2], atol=1e-9)
+    held = controller.step(decision.state, x, reference)
+    assert (held.u == decision.u).all()
+
+
 def test_nothing_happens_without_an_event():
     """With a perfect model and no noise the outputs follow the plan, as long as its inputs are those applied."""
     problem = tank_problem(control_horizon=1)

@@ -15,7 +15,11 @@ from mampc.base.errors import MampcError
 from mampc.base.words import Status
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState
-from mampc.methods.method import Plan
+from mampc.controllers.mpc import MPC
+from mampc.methods.method import HELD_BY, Plan
+from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.pattern_solver import PatternSolver
+from mampc.moves.rules import MoveRules
 from mampc.program.prediction import Prediction
 from mampc.program.sample import Sample
 
@@ -127,6 +131,8 @@ class Rounded(Rule):
 class Periodic(Rule):
     """Inputs move at every q-th sample only: slower sampling with the same model.
 
+    Plain MPC plans with moves at those samples; a controller with rules of its own does not know that it is held.
+
     Args:
         controller: see `Rule`.
         every: q >= 1, samples.
@@ -135,6 +141,21 @@ class Periodic(Rule):
     def __init__(self, controller: Controller, *, every: int) -> None:
         super().__init__(controller)
         self._every = as_whole("every", every, 1, 10_000)
+        n_c, m = self._shape
+        self._due = np.repeat(np.arange(n_c) % self._every == 0, m)
+        self._planner: PatternSolver | None = None
+        if isinstance(controller, MPC) and self._every > 1:
+            self._planner = PatternSolver(self.condensed, AdmissiblePatterns(MoveRules(), m, n_c))
+
+    def plan(self, sample: Sample, state: ControllerState) -> Plan:
+        """At its samples the first moves of the plan, else none."""
+        if self._planner is None or sample.frozen is not None or not self.is_due(sample, state):
+            return super().plan(sample, state)
+        solved = self._planner.solve(sample, self._due)
+        if solved.moves is None:
+            return Plan(None, HELD_BY.get(solved.status, Status.HELD_SOLVER_FAILED), solved.programs)
+        first = solved.moves[: len(sample.u_previous)]
+        return self._only(first, Plan(None, Status.FEASIBLE, solved.programs))
 
     def is_due(self, sample: Sample, state: ControllerState) -> bool:
         return state.samples % self._every == 0
@@ -162,7 +183,9 @@ class Predicted(Rule):
 class EventTriggered(Predicted):
     """Inputs move when outputs differ from what the last executed plan predicted (Heemels et al. 2012).
 
-    A new reference, and the end of that plan's horizon, are events as well.
+    A new reference, and the end of that plan's horizon, are events as well. Of the plan only the first move is
+    made, and what it predicted is with all of them: with the first alone in the prediction, or with all of them made,
+    there are more moves.
 
     Args:
         controller: see `Rule`.
