@@ -12,7 +12,7 @@ from mampc.base.errors import MampcError
 
 _ROUNDS = 60  # each doubles the number of samples seen
 _SETTLED = 1e-10  # what one more doubling may still add, as a share of what is there
-_ROUNDED = 1e-8  # the same where rounding lets it add more with every further doubling
+_ROUNDED = 1e-6  # the same where rounding lets it add more with every further doubling, after a sample for each state
 _SCALING = 5  # doublings that tell how far states go
 
 
@@ -38,12 +38,12 @@ def seen_covariance(A: Array, C: Array, Q: Array, R: Array) -> Array:
         MampcError: it does not settle: a mode that grows is not seen, or never disturbed.
     """
     last, added = Q, np.inf
-    for P, more in _doubled(A, C, Q, R):
+    for rounds, (P, more) in enumerate(_doubled(A, C, Q, R), 1):
         size = np.sqrt(np.outer(np.diag(C @ P @ C.T) + np.diag(R), np.diag(P)))
         last_added, added = added, float((np.abs(C @ more) / np.where(size > 0, size, 1.0)).max(initial=0.0))
         if added <= _SETTLED:
             return P
-        if last_added <= _ROUNDED and not added < last_added:
+        if last_added <= _ROUNDED and not added < last_added and 2**rounds > len(A):
             return last
         last = P
     raise MampcError("expected a model whose modes are all seen and disturbed, the Riccati equation failed")
