@@ -163,6 +163,7 @@ class Member:
         units = np.outer(of_z, of_z)
         scaled = self.A * of_z / of_z[:, None], self.C * of_z / loads.noise[:, None]
         self.covariance = units * seen_covariance(*scaled, Q / units, np.eye(l))
+        self._gains: dict[bytes, Array] = {}
         self._fastest = max(1.0, float(np.abs(model.poles()).max(initial=0.0)))
         if not self._growth(self.gain(np.ones(l, dtype=bool))) <= 1 + RUNS_AWAY:
             raise MampcError("expected a model whose growing modes are all seen in its outputs")
@@ -172,11 +173,15 @@ class Member:
 
         Should the rest be too little to keep the estimate from running away, nothing is corrected.
         """
-        C, P = self.C[believed], self.covariance
-        gain = np.zeros((len(P), len(believed)))
-        if believed.any():
-            gain[:, believed] = np.linalg.solve(self.innovation_covariance(believed), C @ P).T
-        return gain if self._growth(gain) <= self._fastest + RUNS_AWAY else np.zeros_like(gain)
+        key = believed.tobytes()
+        if key not in self._gains:
+            C, P = self.C[believed], self.covariance
+            gain = np.zeros((len(P), len(believed)))
+            if believed.any():
+                gain[:, believed] = np.linalg.solve(self.innovation_covariance(believed), C @ P).T
+            stays = self._growth(gain) <= self._fastest + RUNS_AWAY
+            self._gains[key] = gain if stays else np.zeros_like(gain)
+        return self._gains[key]
 
     def _growth(self, gain: Array) -> float:
         """By what the error of the estimate grows from sample to sample, in the end, with a gain."""
