@@ -240,6 +240,7 @@ MEMORY_PROBE = """
     import re
     from pathlib import Path
     import numpy as np
+    from scipy.signal import lfilter
     import mampc
 
     def peak():
@@ -249,8 +250,8 @@ MEMORY_PROBE = """
     def identify(samples):
         model = mampc.StateSpace(np.diag([0.9, 0.7, 0.5, 0.3]), B, C, None, 1.0)
         u = mampc.prbs(order=14, hold=3, inputs=2, samples=samples)
-        y = model.response(u) + 0.1 * rng.standard_normal((samples, 2))
-        mampc.n4sid(mampc.IOData(u, y, 1.0))
+        noise = lfilter([1.0], [1.0, -0.9], rng.standard_normal((samples, 2)), axis=0)
+        mampc.n4sid(mampc.IOData(u, model.response(u) + 0.1 * noise, 1.0)).uncertainty(50)
         return peak()
 
     rng = np.random.default_rng(0)

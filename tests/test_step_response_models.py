@@ -38,6 +38,21 @@ def test_twelve_outputs_and_five_inputs_take_few_states():
     assert (np.abs(beyond - S[-1]) <= 0.03 * np.abs(S).max(axis=0)).all()
 
 
+@pytest.mark.parametrize("absent", [[(0, 1)], [(1, 0)], [(0, 1), (1, 0)], [(0, 0), (0, 1)]])
+def test_what_an_input_does_not_move_stays_exactly_still_and_costs_no_states(absent):
+    gain = np.array([[12.8, -18.9], [6.6, -19.4]])
+    whole = StateSpace.from_first_order(
+        gain=gain, time_constant=[[1002, 1260], [654, 864]], dead_time=[[60, 180], [420, 180]], dt=60.0
+    ).step_response(120)
+    S = whole.copy()
+    for i, j in absent:
+        S[:, i, j] = 0.0
+    model = StateSpace.from_step_response(S, dt=60.0)
+    assert worst(model, S) <= 0.01
+    assert not model.step_response(300)[:, [i for i, _ in absent], [j for _, j in absent]].any()
+    assert model.n_states <= StateSpace.from_step_response(whole, dt=60.0).n_states + 4
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.1, 0.01, 1e-4]))
 def test_any_coefficients_are_met_to_the_accuracy_asked(seed, accuracy):

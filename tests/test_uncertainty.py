@@ -6,6 +6,8 @@ import pytest
 import mampc
 from mampc import IOData, MampcError, Noise, StateSpace, n4sid, prbs
 from mampc.identification.drift import noise_and_walk, white_and_walk
+from mampc.identification.scaling import scaled
+from mampc.identification.uncertainty import telling
 
 PLANT = StateSpace(
     [[0.9, 0.05], [0.0, 0.8]], [[0.1, 0.05], [0.0, 0.3]], np.eye(2), None, 10.0, [5.0, 6.0], [1.0, 2.0]
@@ -117,3 +119,33 @@ def test_a_record_too_short_for_segments_is_told():
     fitted = n4sid(IOData(*signals, 1.0), feedthrough=False, order=1)
     with pytest.raises(MampcError, match=r"uncertainty: expected records"):
         fitted.uncertainty(10)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_a_part_of_a_long_record_says_how_certain_all_of_it_is(monkeypatch, unit):
+    fitted = n4sid(record(3, samples=4000, units=(unit, 1.0)), feedthrough=False)
+    whole = fitted.uncertainty(60)[-1]
+    monkeypatch.setattr("mampc.identification.uncertainty.PLENTY", 1000)
+    told = []
+    few = fitted.uncertainty(60, progress=told.append)[-1]
+    assert told == list(range(8))
+    ratio = np.linalg.norm(few) / np.linalg.norm(whole)
+    assert 0.4 < ratio < 2.5
+
+
+def test_the_part_is_one_in_which_every_input_moves(monkeypatch):
+    monkeypatch.setattr("mampc.identification.uncertainty.PLENTY", 1200)
+    data = record(4, samples=6000)
+    u = data.u.copy()
+    u[:, 0] = np.where(np.arange(6000) < 4500, u[0, 0], u[:, 0])  # still at first
+    [rows] = telling(scaled([IOData(u, data.y, data.dt)]))
+    assert rows.start >= 4200
+    assert rows.stop - rows.start == 1200
+
+
+def test_of_many_short_records_the_longest_are_looked_at():
+    records = scaled([record(5, samples=50 + k) for k in range(100)])
+    few = records.shortened(1000)
+    assert [len(u) for u in few.u] == list(range(144 - len(few.u) + 6, 150))
+    assert len(few.y_mean) == len(few.u)
+    assert 1000 <= few.samples < 1150

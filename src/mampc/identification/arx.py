@@ -45,7 +45,7 @@ def estimate_arx(
         shortest = min(map(len, seen.u))
         most = max(1, min(HIGHEST, (shortest - 10) // (4 * (len(row) + 2))))
 
-        def dynamics(n: int, seen: Scaled = seen) -> tuple[Array, Array]:
+        def dynamics(n: int, seen: Scaled) -> tuple[Array, Array]:
             found = denominator(seen.u, seen.y, n, PROJECTED[trend], first)
             return _companion(refined(found, seen, first) if trend == "whitened" else found)
 

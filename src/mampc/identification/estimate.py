@@ -47,7 +47,7 @@ DEGREES = {
 }  # of the trend that is fitted
 PROJECTED = {"none": -1, "constant": 0, "linear": 1, "differences": 0, "whitened": 0}  # taken off Hankel rows
 
-Dynamics = Callable[[int], tuple[Array, Array]]  # A and C of an order
+Dynamics = Callable[[int, Scaled], tuple[Array, Array]]  # A and C of an order, from records
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,9 @@ def _estimated(
         orders = range(settings.order, settings.order + 1)
     else:
         raise MampcError(f"order: expected at most {most} with {s} block rows, received {settings.order}")
-    part = finished(lambda n: realise(gamma[:, :n], l), orders, own, seen, outputs, delays, settings, trend)
+    part = finished(
+        lambda n, _: realise(gamma[:, :n], l), orders, own, seen, outputs, delays, settings, trend
+    )
     return part, values
 
 
@@ -103,6 +105,8 @@ def finished(
     settings: Settings, trend: str,
 ) -> Part:  # fmt: skip
     """A part from A and C of several orders: the order that explains the records best for its size.
+
+    Orders are compared on no more samples than that takes.
 
     Args:
         own: the records of the part.
@@ -118,7 +122,7 @@ def finished(
 
     def attempt(n: int) -> Part:
         if n not in tried:
-            A, C = dynamics(n)
+            A, C = dynamics(n, few)
             A, stabilised = inside_unit_circle(A, settings.unstable)
             tried[n] = Part(outputs, delays, A, C, 0, stabilised, fitted(A, C, 0, few))
         return tried[n]
@@ -128,11 +132,11 @@ def finished(
         return residuals(part.A, part.C, part.fit, few)
 
     part = attempt(_likeliest(left, orders, few.u[0].shape[1], white=trend == "whitened"))
+    A, C = dynamics(len(part.A), seen)
     if few is not seen:
-        part = part._replace(fit=fitted(part.A, part.C))
-    part = _with_integrators(
-        part, *dynamics(len(part.A)), seen, settings.unstable, fitted, spare=len(orders) > 1
-    )
+        stable, stabilised = inside_unit_circle(A, settings.unstable)
+        part = part._replace(A=stable, C=C, stabilised=stabilised, fit=fitted(stable, C))
+    part = _with_integrators(part, A, C, seen, settings.unstable, fitted, spare=len(orders) > 1)
     if trend in FILTERED:
         return _on_levels(part, own)
     return _without_idle_constant(part, seen, settings.feedthrough) if trend == "constant" else part

@@ -19,7 +19,7 @@ from mampc.identification.estimate import DEGREES, Settings
 from mampc.identification.parts import Part, assembled, part_residuals
 from mampc.identification.scaling import Scaled, scaled
 from mampc.identification.subspace import WEIGHTINGS
-from mampc.identification.uncertainty import jackknife, unmodelled
+from mampc.identification.uncertainty import jackknife, movement, telling, unmodelled
 from mampc.identification.validation import Validation, fit_to_all, validate
 from mampc.systems.noise import Noise
 from mampc.systems.state_space import StateSpace
@@ -63,26 +63,31 @@ class Identified:
     stabilised: bool
     _estimate: _Estimate = field(repr=False)
 
-    def uncertainty(self, samples: int, *, segments: int = 8) -> Array:
+    def uncertainty(
+        self, samples: int, *, segments: int = 8, progress: Callable[[int], None] | None = None
+    ) -> Array:
         """Standard deviations of the step response, shape (samples, l, m + d); see `StateSpace.step_response`.
 
         The model is estimated again, trend, dead times and order as they are, without one segment of the record
         after another; what it may lack beyond is sought in what it leaves of the record (see `unmodelled`). A
-        disturbance that moved with an input does not show.
+        disturbance that moved with an input does not show. Of long records a part is looked at (see `telling`).
 
         Args:
             samples: of the response.
             segments: at least 3.
+            progress: is told how many segments are done.
 
         Raises:
             MampcError: records too short for that.
         """
         as_whole("segments", segments, 3)
         as_whole("samples", samples, 1)
-        chance = jackknife(
-            self._estimate.records, segments, lambda rest: self._estimate.response(rest, samples)
-        )
-        return np.sqrt(chance**2 + self._estimate.lacking(samples))
+        whole, where = self._estimate.records, telling(self._estimate.records)
+        few = whole.stretches(where)
+        tell = progress if progress is not None else (lambda done: None)
+        chance = jackknife(few, segments, lambda rest: self._estimate.response(rest, samples), tell)
+        chance = chance * np.sqrt(movement(few) / np.maximum(movement(whole), 1e-300))
+        return np.sqrt(chance**2 + self._estimate.lacking(samples, where))
 
     def validate(self, data: IOData) -> Validation:
         """Simulate the model on another record, drifts set aside as they were here; see `mampc.validate`."""
@@ -192,13 +197,13 @@ class _Estimate:
         parts = estimated(records, self.settings, self.choice, orders=[len(part.A) for part in self.parts])
         return assembled(parts, records, self.like).step_response(samples)
 
-    def lacking(self, samples: int) -> Array:
+    def lacking(self, samples: int, where: Sequence[slice]) -> Array:
         """Mean square of what the step response may lack, in the same shape."""
         if self.choice.predictor:
             return np.zeros((samples, *self.choice.delays.shape))
         records = self.records
         units = records.y_spread[:, None] / records.u_spread
-        return unmodelled(self.parts, records, samples) * units**2
+        return unmodelled(self.parts, records, where, samples) * units**2
 
 
 def _under_feedback(records: Scaled) -> bool:

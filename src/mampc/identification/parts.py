@@ -59,6 +59,8 @@ def groups(delays: Integers) -> list[tuple[tuple[int, ...], Integers]]:
 def records_of_part(records: Scaled, outputs: Sequence[int], delays: Integers) -> Scaled:
     """The records as a part sees them: inputs set back, samples without a past left out."""
     longest, picked = int(delays.max(initial=0)), list(outputs)
+    if not longest and picked == list(range(len(records.y_spread))):
+        return records
     u, y = [], []
     for inputs, measured in zip(records.u, records.y, strict=True):
         N = len(inputs)

@@ -23,6 +23,7 @@ ITERATIONS = 20
 SETTLED = 1e-6  # change of a coefficient
 EDGE = 1 - 1e-9  # largest pole
 SHORTEST = 8  # samples of a record, of which the filter takes a quarter
+_CHUNK = 4096  # equations at once
 EACH = 20  # samples for each coefficient of the ARX model, at least
 
 
@@ -51,22 +52,22 @@ def denominator(u: Sequence[Array], y: Sequence[Array], n: int, degree: int, fir
 
     Inputs count from the lag `first` on: under feedback, those of the same sample know the disturbance.
     """
-    R: Array = np.empty((0, 0))
+    own, width = degree + 1, u[0].shape[1] * (n + 1 - first) + n + 1
+    total: Array = np.empty((0, width))
     for inputs, output in zip(u, y, strict=True):
         N = len(output) - n
-        time = np.arange(N) / N - 0.5
-        columns: list[Array] = [time[:, None] ** np.arange(degree + 1)]
-        columns += [inputs[n - i : n - i + N] for i in range(first, n + 1)]
-        columns += [output[n - i : n - i + N] for i in range(1, n + 1)]
-        rows = np.concatenate([*columns, output[n:]], axis=1)
-        own = degree + 1
-        R = fold(R if R.size else np.empty((0, rows.shape[1] - own)), _reduced(rows, own))
-    return solve(R)[-n:]
-
-
-def _reduced(rows: Array, own: int) -> Array:
-    """Rows without their first columns, which are projected off."""
-    return fold(np.empty((0, rows.shape[1])), rows)[own:, own:]
+        if own >= N:  # too short to say anything
+            continue
+        R: Array = np.empty((0, own + width))
+        for start in range(0, N, _CHUNK):
+            stop = min(start + _CHUNK, N)
+            time = np.arange(start, stop) / N - 0.5
+            columns: list[Array] = [time[:, None] ** np.arange(own)]
+            columns += [inputs[n - i + start : n - i + stop] for i in range(first, n + 1)]
+            columns += [output[n - i + start : n - i + stop] for i in range(1, n + 1)]
+            R = fold(R, np.concatenate([*columns, output[n + start : n + stop]], axis=1))
+        total = fold(total, R[own:, own:])
+    return solve(total)[-n:]
 
 
 def refined(a: Array, records: Scaled, first: int) -> Array:

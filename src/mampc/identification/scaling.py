@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
+
+LONG = 1000  # samples of a record that say enough of its plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +38,36 @@ class Scaled:
         return sum(map(len, self.u))
 
     def shortened(self, samples: int) -> Scaled:
-        """No more than about so many samples: the same share of every record, from its beginning."""
-        share = samples / self.samples
-        if share >= 1:
+        """No more than about so many samples, the first ones of each record; see `lengths`."""
+        if samples >= self.samples:
             return self
-        cuts = [max(1, round(share * len(u))) for u in self.u]
-        return self.replaced(
-            [u[:cut] for u, cut in zip(self.u, cuts, strict=True)],
-            [y[:cut] for y, cut in zip(self.y, cuts, strict=True)],
-        )
+        return self.stretches([slice(0, length) for length in self.lengths(samples)])
+
+    def lengths(self, samples: int) -> list[int]:
+        """Of how many samples of each record about so many in all consist.
+
+        The same share of each, or, where these would be short, the longest records and none of the others.
+        """
+        share = min(1.0, samples / self.samples)
+        own = [max(1, round(share * len(u))) for u in self.u]
+        if max(own) >= min(LONG, max(map(len, self.u))):
+            return own
+        taken, lengths = 0, [0] * len(self.u)
+        for k in sorted(range(len(self.u)), key=lambda k: -len(self.u[k])):
+            if taken < samples:
+                lengths[k] = len(self.u[k])
+                taken += lengths[k]
+        return lengths
+
+    def stretches(self, where: Sequence[slice]) -> Scaled:
+        """One stretch of each record; records of which nothing is taken are left out."""
+        kept = [
+            (u[rows], y[rows], mean)
+            for u, y, mean, rows in zip(self.u, self.y, self.y_mean, where, strict=True)
+            if rows.stop > rows.start
+        ]
+        u, y, means = (tuple(signals) for signals in zip(*kept, strict=True))
+        return replace(self, u=u, y=y, y_mean=means)
 
     def replaced(self, u: Sequence[Array], y: Sequence[Array]) -> Scaled:
         """The same units and means for other samples."""

@@ -6,8 +6,8 @@ outputs linearly. The outputs of (A, e_i, C) are first-order filters in a row on
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from mampc.identification.triangular import fold, solve
 
 _CORRELATED = 2**16  # samples whose autocorrelation is looked at
 _ENTRIES = 2**20  # numbers taken into the triangular factor at once, 8 MB
+
+
+Signals: TypeAlias = Callable[[slice], Array]  # some rows of what would be large as a whole
 
 
 class Trend(NamedTuple):
@@ -83,10 +86,8 @@ def fit_trends(
     A: Array, C: Array, B: Array, D: Array, records: Scaled, *, degree: int, integrators: int
 ) -> list[Trend]:
     """Only the trends, B and D being known; see `fit_inputs`."""
-    unexplained = [
-        y - states(A, u @ B.T, np.zeros(len(A))) @ C.T - u @ D.T
-        for u, y in zip(records.u, records.y, strict=True)
-    ]
+    still = Trend(np.zeros(len(A)), np.empty((0, len(C))), np.empty(0))
+    unexplained = residuals(A, C, InputFit(B, D, [still] * len(records.u), 0.0), records)
     without = records.replaced([u[:, :0] for u in records.u], unexplained)
     return fit_inputs(A, C, without, feedthrough=False, degree=degree, integrators=integrators).trends
 
@@ -96,16 +97,21 @@ def _rows(
 ) -> Iterator[Array]:
     """Blocks of equations: x0, polynomial, drive, B, D, and the right-hand side; l rows per sample."""
     (l, n), (N, m) = C.shape, u.shape
-    signals = np.zeros((N, m + 1 + (drives > 0)))
-    signals[0, 0] = 1.0
-    signals[1:, 1 : 1 + m] = u[:-1]
-    signals[1:, 1 + m :] = 1.0 / N  # of the size of its sum
-    time = np.arange(N) / N - 0.5
+
+    def signals(rows: slice) -> Array:
+        """One sample at the start, the inputs a sample ago, and a constant that adds up to one."""
+        block = np.zeros((rows.stop - rows.start, m + 1 + (drives > 0)))
+        first = rows.start == 0
+        block[0, 0] = first
+        block[first:, 1 : 1 + m] = u[rows.start - 1 + first : rows.stop - 1]
+        block[first:, 1 + m :] = 1.0 / N
+        return block
+
     start = 0
-    for response in filtered(A, C, signals):
+    for response in filtered(A, C, signals, (N, m + 1 + (drives > 0))):
         count = len(response)
         chunk = slice(start, start + count)
-        powers = time[chunk, None] ** np.arange(degree + 1)
+        powers = _time(chunk, N)[:, None] ** np.arange(degree + 1)
         parts = [
             response[..., 0],
             np.einsum("kd,lc->kldc", powers, directions).reshape(count, l, -1),
@@ -119,11 +125,12 @@ def _rows(
         start += count
 
 
-def filtered(A: Array, C: Array, signals: Array) -> Iterator[Array]:
+def filtered(A: Array, C: Array, signals: Signals, shape: tuple[int, int]) -> Iterator[Array]:
     """What (A, e_i, C) makes of each signal w: sum over j <= k of C A^(k-j) e_i w(j), in blocks of samples.
 
     Args:
-        signals: shape (N, p).
+        signals: makes some rows of them.
+        shape: (N, p), of all.
 
     Yields:
         shape (block, l, n, p).
@@ -131,7 +138,7 @@ def filtered(A: Array, C: Array, signals: Array) -> Iterator[Array]:
     from scipy.linalg import rsf2csf, schur
     from scipy.signal import lfilter
 
-    (l, n), (N, p) = C.shape, signals.shape
+    (l, n), (N, p) = C.shape, shape
     T, U = schur(A, output="real")
     if np.any(np.diag(T, -1)):
         T, U = rsf2csf(T, U)
@@ -139,7 +146,7 @@ def filtered(A: Array, C: Array, signals: Array) -> Iterator[Array]:
     block = max(1, min(N, _ENTRIES // (4 * l * n * p)))
     last = np.zeros((n, l, p, 1), dtype=T.dtype)
     for start in range(0, N, block):
-        w = signals[start : start + block].T
+        w = signals(slice(start, min(start + block, N))).T
         G = np.empty((n, l, p, w.shape[1]), dtype=T.dtype)
         before = np.empty_like(G)  # G one sample earlier
         for i in range(n):
@@ -160,14 +167,16 @@ def _complement(C: Array) -> Array:
 
 def residuals(A: Array, C: Array, fit: InputFit, records: Scaled) -> list[Array]:
     """Measured less simulated outputs of each record, shape (N, l), in the units of `records`."""
-    left: list[Array] = []
+    found: list[Array] = []
+    drive = np.zeros(len(A))
     for u, y, trend in zip(records.u, records.y, fit.trends, strict=True):
-        push = u @ fit.B.T
-        push[:, : len(trend.drive)] += trend.drive
-        time = np.arange(len(u)) / len(u) - 0.5
-        constants = time[:, None] ** np.arange(len(trend.polynomial)) @ trend.polynomial
-        left.append(y - states(A, push, trend.x0) @ C.T - u @ fit.D.T - constants)
-    return left
+        drive[: len(trend.drive)] = trend.drive
+        left = np.empty_like(y)
+        for rows, x in _states(A, lambda rows, u=u: u[rows] @ fit.B.T + drive, len(u), trend.x0):  # type: ignore[misc]
+            constants = _time(rows, len(u))[:, None] ** np.arange(len(trend.polynomial)) @ trend.polynomial
+            left[rows] = y[rows] - x @ C.T - u[rows] @ fit.D.T - constants
+        found.append(left)
+    return found
 
 
 def integrated(A: Array, C: Array, fit: InputFit, records: Scaled, integrators: int) -> list[Array]:
@@ -184,6 +193,11 @@ def integrated(A: Array, C: Array, fit: InputFit, records: Scaled, integrators: 
 
 def states(A: Array, push: Array, x0: Array) -> Array:
     """x[k + 1] = A x[k] + push[k] from x[0] = x0, shape (N, n), without a loop over samples."""
+    return np.concatenate([x for _, x in _states(A, lambda rows: push[rows], len(push), x0)])
+
+
+def _states(A: Array, push: Signals, N: int, x0: Array) -> Iterator[tuple[slice, Array]]:
+    """The same in blocks of samples: which they are, and x of shape (block, n)."""
     from scipy.linalg import rsf2csf, schur
     from scipy.signal import lfilter
 
@@ -191,14 +205,22 @@ def states(A: Array, push: Array, x0: Array) -> Array:
     T, U = schur(A, output="real")
     if np.any(np.diag(T, -1)):
         T, U = rsf2csf(T, U)
-    z = np.zeros((n, len(push) + 1), dtype=T.dtype)
-    z[:, 0] = U.conj().T @ x0
-    z[:, 1:] = U.conj().T @ push.T
-    for i in range(n - 1, -1, -1):
-        z[i, 1:] += T[i, i + 1 :] @ z[i + 1 :, :-1]
-        z[i] = lfilter([1.0], [1.0, -T[i, i]], z[i])
-    x: Array = np.real(U @ z[:, :-1]).T
-    return x
+    last = U.conj().T @ x0
+    block = max(1, _ENTRIES // (8 * max(n, 1)))
+    for start in range(0, N, block):
+        rows = slice(start, min(start + block, N))
+        z = np.empty((n, rows.stop - start + 1), dtype=T.dtype)
+        z[:, 0], z[:, 1:] = last, U.conj().T @ push(rows).T
+        for i in range(n - 1, -1, -1):
+            z[i, 1:] += T[i, i + 1 :] @ z[i + 1 :, :-1]
+            z[i] = lfilter([1.0], [1.0, -T[i, i]], z[i])
+        last = z[:, -1].copy()
+        yield rows, np.real(U @ z[:, :-1]).T
+
+
+def _time(rows: slice, N: int) -> Array:
+    """From -1/2 to 1/2 over a record of N samples."""
+    return np.arange(rows.start, rows.stop) / N - 0.5
 
 
 def independent_samples(residuals: Sequence[Array]) -> float:

@@ -1,7 +1,8 @@
 """How uncertain a model's step responses are: what chance makes of them, and what the model lacks.
 
 Chance: the model is estimated again without one segment of the records after another. What all of these lack, such as a
-slow mode that the noise hides, is sought in what the model leaves of the records (`unmodelled`).
+slow mode that the noise hides, is sought in what the model leaves of the records (`unmodelled`). Both look at no more
+samples than it takes: where inputs moved most, of each record (`telling`); chance is less by what they moved elsewhere.
 
 Source: the delete-one jackknife (Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11), with
 segments that are long against the plant's memory in place of single samples (Künsch, Annals of Statistics 17 (1989)).
@@ -23,17 +24,41 @@ from mampc.identification.scaling import Scaled
 LAGS = 8  # time constants of what a model may lack
 SLOWER = (0, 1, 2)  # powers of a lag's time constant with which its variance may grow
 VARIANCES = 10.0 ** np.arange(-8, 2)  # of the slowest lag's gain
+PLENTY = 50_000  # samples that both look at
 PAST, LEAST = 20, 8  # values that make a disturbance white, and samples of a record that says something
 
 
-def jackknife(records: Scaled, segments: int, response: Callable[[Scaled], Array]) -> Array:
-    """Standard deviations of what `response` makes of the records, in its shape.
+def telling(records: Scaled) -> list[slice]:
+    """The stretch of each record, `PLENTY` samples of all, in which inputs moved most, all of them."""
+    found = []
+    for u, length in zip(records.u, records.lengths(PLENTY), strict=True):
+        start = 0
+        if 0 < length < len(u):
+            moved = np.cumsum(np.diff(u, axis=0, prepend=u[:1]) ** 2, axis=0)
+            starts = np.arange(0, len(u) - length + 1, max(1, length // 4))
+            inside = (moved[starts + length - 1] - moved[starts]) / np.maximum(moved[-1], 1e-300)
+            start = int(starts[np.argmax(inside.prod(axis=1))])
+        found.append(slice(start, start + length))
+    return found
+
+
+def movement(records: Scaled) -> Array:
+    """By how much each input moved, the sum of squares of its changes, shape (m,)."""
+    total: Array = sum(np.sum(np.diff(u, axis=0) ** 2, axis=0) for u in records.u)
+    return total
+
+
+def jackknife(
+    records: Scaled, segments: int, response: Callable[[Scaled], Array], tell: Callable[[int], None]
+) -> Array:
+    """Standard deviations of what `response` makes of the records, in its shape; `tell` is told each segment.
 
     Raises:
         MampcError: fewer than three segments leave enough to estimate on.
     """
     found = []
     for left_out in range(segments):
+        tell(left_out)
         try:
             found.append(response(_without(records, left_out / segments, (left_out + 1) / segments)))
         except (MampcError, np.linalg.LinAlgError):
@@ -72,32 +97,35 @@ def _pieces(length: int, first: int, last: int) -> Sequence[slice]:
     return [side for side in sides if side.stop > side.start]
 
 
-def unmodelled(parts: Sequence[Part], records: Scaled, samples: int) -> Array:
+def unmodelled(parts: Sequence[Part], records: Scaled, where: Sequence[slice], samples: int) -> Array:
     """Mean square of what the parts' step responses may lack, shape (samples, l, m), in units of the spreads.
 
-    What a part leaves of an output is explained by lags of every input, from a sample to a tenth of the longest record,
-    the disturbance made white by its own past. Gains of lags are normal about zero with a variance of which little is
-    known: a mean is taken over its powers of ten, each as likely as it makes the residuals.
+    What a part leaves of an output in these stretches is explained by lags of every input, from a sample to a tenth of
+    the longest stretch, the disturbance made white by its own past. Gains of lags are normal about zero with a variance
+    of which little is known: a mean is taken over its powers of ten, each as likely as it makes the residuals.
 
     Sources: Ljung, Model validation and model error modeling, Åström symposium on control (1999); MacKay, Bayesian
     interpolation, Neural Computation 4 (1992).
     """
     from scipy.signal import lfilter
 
-    longest, m = max(map(len, records.u)), records.u[0].shape[1]
+    inputs = [u[rows] for u, rows in zip(records.u, where, strict=True)]
+    longest, m = max(map(len, inputs)), records.u[0].shape[1]
     size = np.geomspace(min(1.0, 10 / longest), 1.0, LAGS)  # time constants, of the slowest
     poles = np.exp(-10 / longest / size)
     steps = 1 - poles ** np.arange(samples)[:, None]  # (samples, LAGS)
     lagged = [
-        np.concatenate([lfilter([0.0, 1 - p], [1.0, -p], u, axis=0) for p in poles], axis=1)
-        for u in records.u
+        np.concatenate([lfilter([0.0, 1 - p], [1.0, -p], u, axis=0) for p in poles], axis=1) for u in inputs
     ]
     lacking = np.zeros((samples, len(records.y_spread), m))
     for part in parts:
-        seen = [rows for rows in lagged if len(rows) > part.delays.max(initial=0)]
-        pairs = [
-            pair for pair in zip(seen, part_residuals(part, records), strict=True) if len(pair[1]) > LEAST
+        late = int(part.delays.max(initial=0))
+        seen = [k for k, u in enumerate(records.u) if len(u) > late]
+        ends = [(max(where[k].start - late, 0), max(where[k].stop - late, 0)) for k in seen]
+        lefts = [
+            left[first:last] for left, (first, last) in zip(part_residuals(part, records), ends, strict=True)
         ]
+        pairs = [(lagged[k], left) for k, left in zip(seen, lefts, strict=True) if len(left) > LEAST]
         if not pairs:
             continue
         past = min(PAST, min(len(left) for _, left in pairs) // 4)

@@ -102,13 +102,11 @@ def initial_state(model: StateSpace, data: IOData, *, drift: bool = False) -> tu
     unexplained = data.y - model.response(data.u)
     spread = data.y.std(axis=0)
     spread[spread == 0.0] = 1.0
-    impulse = np.zeros((N, 1))
-    impulse[0] = 1.0
     lines = _lines(N) if drift else np.empty((N, 0))
     own = lines.shape[1] * l
     factor: Array = np.empty((0, n + own + 1))
     start = 0
-    for free in filtered(model.A, model.C / spread[:, None], impulse):
+    for free in filtered(model.A, model.C / spread[:, None], _impulse, (N, 1)):
         chunk = slice(start, start + len(free))
         at_outputs = np.einsum("kd,op->kodp", lines[chunk], np.eye(l)).reshape(len(free), l, own)
         right = (unexplained[chunk] / spread)[..., None]
@@ -136,17 +134,23 @@ def _predicted(model: StateSpace, data: IOData) -> tuple[Array, Array]:
     predictor, du = A - K @ C, data.u - model.all_inputs_op
     direct = (data.y - model.y_op) / spread - du @ (model.D / spread[:, None]).T
     explained = states(predictor, du @ model.B.T + direct @ K.T, np.zeros(len(A))) @ C.T
-    impulse = np.zeros((len(data), 1))
-    impulse[0] = 1.0
-    free = np.concatenate(list(filtered(predictor, C, impulse)))[..., 0]
+    free = np.concatenate(list(filtered(predictor, C, _impulse, (len(data), 1))))[..., 0]
     x0 = np.linalg.lstsq(free.reshape(-1, len(A)), (direct - explained).reshape(-1))[0]
     return x0, data.y - (direct - explained - free @ x0) * spread
 
 
+def _impulse(rows: slice) -> Array:
+    """One at the first sample of all."""
+    impulse: Array = (np.arange(rows.start, rows.stop) == 0)[:, None].astype(float)
+    return impulse
+
+
 def _lines(samples: int) -> Array:
     """An orthonormal basis of lines in time, shape (samples, 2)."""
-    time = np.arange(samples) / samples - 0.5
-    return np.linalg.qr(np.column_stack([np.ones(samples), time]))[0]
+    lines: Array = np.empty((samples, 2))
+    lines[:, 0], lines[:, 1] = 1.0, np.arange(samples) - (samples - 1) / 2
+    lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-300)
+    return lines
 
 
 def whiteness(residuals: Array, lags: int = 20) -> Array:

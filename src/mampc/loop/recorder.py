@@ -51,7 +51,10 @@ class Recorder:
     """
 
     def __init__(self, path: str | Path, regulator: Regulator) -> None:
-        self.regulator, self.path = as_instance("regulator", regulator, Regulator), Path(path)
+        self.regulator = as_instance("regulator", regulator, Regulator)
+        if not isinstance(path, (str, Path)):
+            raise MampcError(f"path: expected the name of a file, received {path!r}")
+        self.path = Path(path)
         model = regulator.controller.problem.model
         self._dt, self._l, self._m = model.dt, model.n_outputs, model.n_inputs
         self._shapes, self._samples, self._last = (model.n_disturbances,), 0, None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ from mampc.systems.properties import properties
 POOR_FIT = 40.0  # percent; a model below it is hardly one to control with
 SHORTEST = 10  # samples on either side of a cut
 SHORT = 30  # samples: a piece with fewer has neither past nor future for the usual 15 block rows
+SEGMENTS = 8  # without each of which the model is estimated again
+LONG = 2.0  # seconds of work of which is told
 LONGEST_BAND = 200  # samples of a step response whose uncertainty is kept
 
 
@@ -80,9 +83,8 @@ def identify_and_write(
         raise MampcError("\n  - ".join([str(error), *told])) from None
     validation = identified.validate(rest)
     show("estimating how certain it is")
-    identified = replace(
-        identified, model=replace(identified.model, evidence=evidence_of(identified, records))
-    )
+    evidence = evidence_of(identified, records, lambda words: show(f"estimating how certain it is{words}"))
+    identified = replace(identified, model=replace(identified.model, evidence=evidence))
     show("writing the model and its figure")
     identified.model.save(target)
     warnings = []
@@ -121,16 +123,37 @@ def long_enough(records: Sequence[IOData], notes: list[str]) -> Sequence[IOData]
     return kept
 
 
-def evidence_of(identified: Identified, records: Sequence[IOData]) -> Evidence:
+def evidence_of(
+    identified: Identified, records: Sequence[IOData], show: Callable[[str], None] = lambda words: None
+) -> Evidence:
     """The ranges of all records, and how uncertain the step response is until it has settled."""
-    u, y = (np.concatenate([getattr(record, signal) for record in records]) for signal in ("u", "y"))
+    inputs, outputs = (
+        np.stack(
+            [np.min([s.min(axis=0) for s in own], axis=0), np.max([s.max(axis=0) for s in own], axis=0)],
+            axis=1,
+        )
+        for own in ([record.u for record in records], [record.y for record in records])
+    )
     samples = int(properties(identified.model).settling_time / identified.model.dt) + 1
     try:
-        deviation = identified.uncertainty(min(max(samples, SHORTEST), LONGEST_BAND))
+        deviation = identified.uncertainty(
+            min(max(samples, SHORTEST), LONGEST_BAND), segments=SEGMENTS, progress=time_left(show, SEGMENTS)
+        )
     except MampcError:  # too short a record
         deviation = None
-    inputs, outputs = (np.stack([s.min(axis=0), s.max(axis=0)], axis=1) for s in (u, y))
     return Evidence(inputs, outputs, deviation)
+
+
+def time_left(show: Callable[[str], None], total: int) -> Callable[[int], None]:
+    """Tells how long the rest of some equal pieces of work takes, where it takes long."""
+    start = time.monotonic()
+
+    def tell(done: int) -> None:
+        left = (time.monotonic() - start) / done * (total - done) if done else 0.0
+        if left > LONG:
+            show(f", about {left:.0f} s left")
+
+    return tell
 
 
 def hold_out(records: Sequence[IOData], share: float) -> tuple[list[IOData], IOData]:

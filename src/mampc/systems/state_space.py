@@ -31,6 +31,7 @@ from mampc.base.names import Names, require_count
 from mampc.systems.evidence import Evidence
 from mampc.systems.modes import balanced
 from mampc.systems.noise import Noise
+from mampc.systems.response import responses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,7 +73,9 @@ class StateSpace:
         B = as_matrix("B", self.B, n)
         C = as_matrix("C", self.C, None, n)
         columns, l = B.shape[1], C.shape[0]
-        names = Names.numbered(columns, l, n) if self.names is None else self.names
+        names = (
+            Names.numbered(columns, l, n) if self.names is None else as_instance("names", self.names, Names)
+        )
         d = len(names.disturbances)
         m = columns - d
         if m <= 0 or l == 0:
@@ -256,13 +259,10 @@ class StateSpace:
             MampcError: a continuous model, or inputs of another width.
         """
         as_discrete("response", self)
-        du = as_matrix("u", u, None, self.B.shape[1]) - self.all_inputs_op
+        u = as_matrix("u", u, None, self.B.shape[1])
         x = np.zeros(self.n_states) if x0 is None else as_vector("x0", x0, self.n_states)
-        drive, states = du @ self.B.T, np.empty((len(du), self.n_states))
-        for k in range(len(du)):
-            states[k] = x
-            x = self.A @ x + drive[k]
-        y: Array = states @ self.C.T + du @ self.D.T + self.y_op
+        blocks = responses(self.A, self.B, self.C, self.D, u, self.all_inputs_op, x)
+        y: Array = np.concatenate([np.empty((0, self.n_outputs)), *blocks]) + self.y_op
         return y
 
     def plot(self, *, deviation: Any = None) -> Figure:

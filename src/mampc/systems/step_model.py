@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_number, require_finite
+from mampc.base.checks import Array, BoolArray, as_array, as_number, require_finite
 from mampc.base.errors import MampcError
 from mampc.systems.model_file import MOST_STATES
 from mampc.systems.state_space import StateSpace
@@ -39,18 +39,50 @@ def step_model(S: Any, accuracy: float) -> Matrices:
     columns = (largest / rows[:, None]).max(axis=0)
     columns[columns == 0] = 1.0
     S = S / rows[:, None] / columns  # the largest in each row and column is about one
-    size = np.abs(S).max(axis=0)
-    present = size > ABSENT
-    allowed = np.where(present, accuracy * size, ABSENT)
-    S = np.where(present, S, 0.0)
+    present = np.abs(S).max(axis=0) > ABSENT
+    ways = [_together(S, present, accuracy)]
+    if not present.all():
+        ways.append(_transposed(_together(S.transpose(0, 2, 1), present.T, accuracy)))
+    A, B, C, D = min(ways, key=lambda matrices: len(matrices[0]))
+    if len(A) > MOST_STATES:
+        raise _too_many(accuracy)
+    return A, B * columns, rows[:, None] * C, rows[:, None] * D * columns
 
+
+def _together(S: Array, present: BoolArray, accuracy: float) -> Matrices:
+    """Outputs that the same inputs move, as one model each: no state carries one input to an output that it spares."""
+    _, l, m = S.shape
+    found: Matrices = np.zeros((0, 0)), np.zeros((0, m)), np.zeros((l, 0)), np.zeros((l, m))
+    for pattern in np.unique(present, axis=0):
+        outputs = np.flatnonzero((present == pattern).all(axis=1))
+        at = np.ix_(outputs, np.flatnonzero(pattern))
+        if not pattern.any():
+            continue
+        A, B, C, D = _reduced(S[:, at[0], at[1]], accuracy)
+        to, of, direct = np.zeros((len(A), m)), np.zeros((l, len(A))), np.zeros((l, m))
+        to[:, pattern], of[outputs], direct[at] = B, C, D
+        found = _beside(found, (A, to, of, direct))
+    return found
+
+
+def _reduced(S: Array, accuracy: float) -> Matrices:
+    """A model of responses none of which is absent."""
+    allowed = accuracy * np.abs(S).max(axis=0)
     tails, settled = _tails(S, accuracy)
-    for A, B, C, D in _truncations(settled):
-        matrices = _beside((A, B, C, D), tails)
+    for truncation in _truncations(settled):
+        matrices = _beside(truncation, tails)
         if (np.abs(StateSpace(*matrices, dt=1.0).step_response(len(S)) - S) <= allowed).all():
-            A, B, C, D = matrices
-            return A, B * columns, rows[:, None] * C, rows[:, None] * D * columns
-    raise MampcError(
+            return matrices
+    raise _too_many(accuracy)
+
+
+def _transposed(matrices: Matrices) -> Matrices:
+    A, B, C, D = matrices
+    return A.T, C.T, B.T, D.T
+
+
+def _too_many(accuracy: float) -> MampcError:
+    return MampcError(
         f"from_step_response: expected responses that at most {MOST_STATES} states describe to {100 * accuracy:g} %; "
         "allow more with accuracy, or leave out samples"
     )
@@ -110,8 +142,7 @@ def _truncations(S: Array) -> Any:
     pulses = np.diff(S, axis=0)
     N, l, m = pulses.shape
     if l < m:  # the smaller side is decomposed
-        for A, B, C, D in _truncations(S.transpose(0, 2, 1)):
-            yield A.T, C.T, B.T, D.T
+        yield from map(_transposed, _truncations(S.transpose(0, 2, 1)))
         return
     hankel = np.zeros((N, l, N, m))
     for k in range(N):
