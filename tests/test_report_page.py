@@ -14,6 +14,7 @@ from mampc.report import output
 from mampc.study import parse_study, run_study, template
 
 interactive = pytest.importorskip("mampc.report.interactive")
+page_content = pytest.importorskip("mampc.report.page_content")
 pytest.importorskip("plotly", reason="needs plotly, which mampc[report] brings")
 
 NASTY = '</script><img src=x onerror=alert(1)> $1 & "2" {3}'
@@ -133,7 +134,7 @@ def test_a_run_writes_its_page_or_says_how_to_get_it(tmp_path, monkeypatch):
     ],
 )
 def test_numbers_are_said_to_two_digits(value, text):
-    assert interactive._number(value) == text
+    assert page_content.number(value) == text
 
 
 @pytest.fixture(params=[1280, 390])
@@ -225,10 +226,11 @@ def test_the_page_draws_zones_that_move_as_bands_within_what_a_panel_shows():
     page = interactive.interactive_page(result)
     (scenario,) = content(page)["scenarios"]
     zone = result.runs["noisy"]["MPC"].zone
-    assert scenario["reference"] == [None] * 4
-    assert scenario["zones"][2:] == [None, None]
-    for i, (low, high) in enumerate(scenario["zones"][:2]):
-        bottom, top = scenario["panels"][i]["range"]
+    panels = scenario["panels"]
+    assert [panel["reference"] for panel in panels] == [None] * 4
+    assert [panel["zone"] for panel in panels[2:]] == [None, None]
+    for i, panel in enumerate(panels[:2]):
+        (low, high), (bottom, top) = panel["zone"], panel["range"]
         np.testing.assert_allclose(low, zone.low[:, i], atol=2e-3)
         shown = np.isfinite(zone.high[:, i])
         np.testing.assert_allclose(np.array(high)[shown], zone.high[shown, i], atol=2e-3)

@@ -18,7 +18,8 @@ from mampc.compare.knobs import knob_of
 from mampc.compare.sweep import Sweep, Task, points_of
 from mampc.loop.run import Run
 from mampc.report.fronts import SHOWN, WIDEST
-from mampc.report.interactive import DAY, Means, interactive_page
+from mampc.report.interactive import interactive_page
+from mampc.report.page_content import DAY, Means
 from mampc.study.regulators import regulator_of
 from mampc.study.running import StudyResult, prepare, run_controller
 from mampc.study.schema import ControllerTable

@@ -55,7 +55,8 @@ function drawTradeoff() {
     text: choices.map((one, i) => (i === choice || i === base ? short(one.name) : "")),
     textposition: choices.map((one, i) => {
       const side = place(one.x) < 0.2 ? "right" : place(one.x) > 0.8 ? "left" : "center";
-      return (i === choice ? "top " : "bottom ") + side;
+      const above = choices.some((other) => other.y > one.y && Math.abs(place(other.x) - place(one.x)) < 0.15);
+      return (above || i !== choice ? "bottom " : "top ") + side;
     }),
     marker: { size: choices.map((_, i) => (i === choice ? 15 : 11)), color: choices.map((_, i) => colour(i)), opacity: 1 },
     hovertext: choices.map((one) => plain(one.name, 40) + "<br>" + plain(one.short, 40)), hoverinfo: "text",
@@ -73,6 +74,8 @@ function drawTradeoff() {
     };
   });
   const axis = { rangemode: "tozero", gridcolor: "#ebebeb", zerolinecolor: "#999", automargin: true };
+  // On a telephone each front has a line of the legend, for which the figure grows.
+  tradeoff.style.height = groups.length && tradeoff.clientWidth < 600 ? `${19 + 1.3 * groups.length}rem` : "";
   // The points come second, whatever is drawn beside them.
   Plotly.react(tradeoff, [line, points, ...fronts], {
     font, showlegend: groups.length > 0, legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" }, dragmode: touch ? false : "zoom", hovermode: "closest", uirevision: scenario,
@@ -85,7 +88,7 @@ function drawTradeoff() {
 }
 
 function drawSignals() {
-  const { time, reference, zones, panels, choices, base } = content.scenarios[scenario];
+  const { time, panels, choices, base } = content.scenarios[scenario];
   const own = choices[choice], other = choices[base];
   const narrow = signals.clientWidth < 600;
   const height = narrow ? 150 : 170, total = 100 + height * panels.length;
@@ -120,8 +123,8 @@ function drawSignals() {
         type: "line", xref: "paper", x0: 0, x1: 1, yref: axis, y0: limit, y1: limit, line: { color: BLACK, width: 1, dash: "dot" },
       });
     }
-    if (zones[i]) {
-      const [low, high] = zones[i];
+    if (panel.zone) {
+      const [low, high] = panel.zone;
       for (const [values, fill] of [[low, "none"], [high, "tonexty"]]) {
         traces.push({
           x: time, y: values, name: "zone", legendgroup: "zone", showlegend: fill !== "none" && !seen.has("zone"), yaxis: axis,
@@ -131,7 +134,7 @@ function drawSignals() {
       }
       seen.add("zone");
     }
-    draw(reference[i], "reference", BLACK, true, "dash", axis, 1);
+    draw(panel.reference, "reference", BLACK, true, "dash", axis, 1);
     draw(other.signals[i], other.name, GREY, panel.staircase, "solid", axis, 1.5);
     if (choice !== base) draw(own.signals[i], own.name, BLUE, panel.staircase, "solid", axis, 2);
   });
