@@ -6,7 +6,6 @@ boolean arrays of shape (nc m,), time-major like the moves themselves.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -193,27 +192,25 @@ class AdmissiblePatterns:
         `among`: the moves that they may hold, shape (n_moves,); None for all.
         """
         candidates = self.candidates if among is None else self.candidates & among
-        found: list[list[int]] = []
-        allowance = Allowance(
-            self._most if self.rules.max_moves is None else min(self.rules.max_moves, self._most),
-            self._all_free,
-            False,
-        )
-        for chosen in self._grown([], np.flatnonzero(candidates).tolist(), PatternBuilder(self, allowance)):
-            found.append(chosen)
-            if len(found) > most:
+        left = self._most if self.rules.max_moves is None else min(self.rules.max_moves, self._most)
+        patterns: BoolArray = np.zeros((1, self.n_moves), dtype=bool)
+        # From the last move on: no move, those that hold this one, and those of later ones alone.
+        for i in np.flatnonzero(candidates)[::-1].tolist():
+            added = patterns[self._open_to(i, patterns, left)]
+            added[:, i] = True
+            patterns = np.concatenate((patterns[:1], added, patterns[1:]))
+            if len(patterns) > most:
                 return None
-        patterns = np.zeros((len(found), self.n_moves), dtype=bool)
-        for row, chosen in zip(patterns, found, strict=True):
-            row[chosen] = True
         return patterns
 
-    def _grown(self, chosen: list[int], further: list[int], builder: PatternBuilder) -> Iterator[list[int]]:
-        yield chosen
-        for at, i in enumerate(further):
-            if builder.add(i):
-                yield from self._grown([*chosen, i], further[at + 1 :], builder)
-                builder.remove(i)
+    def _open_to(self, i: int, patterns: BoolArray, left: int) -> BoolArray:
+        """Which patterns of later moves, shape (K, n_moves), may hold move i too, shape (K,)."""
+        (j, a), moved = divmod(i, self.n_inputs), patterns.reshape(len(patterns), -1, self.n_inputs)
+        at_once = moved[:, j].sum(axis=1)
+        counts = self.counts(patterns) + (at_once == 0 if self.simultaneous else 1)
+        soon = moved[:, j + 1 : j + self.rules.dwell, a].any(axis=1)
+        open_to: BoolArray = (counts <= left) & (at_once < self.per_step) & ~soon
+        return open_to
 
 
 class PatternBuilder:
