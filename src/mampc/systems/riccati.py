@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 
 import numpy as np
 
@@ -50,27 +49,19 @@ def seen_covariance(A: Array, C: Array, Q: Array, R: Array) -> Array:
 
 
 def _doubled(A: Array, C: Array, Q: Array, R: Array) -> Iterator[tuple[Array, Array]]:
-    """P after 2, 4, 8, ... samples, and by how much it grew, until numbers overflow; in any units of the states."""
-    spread = np.ones(len(A))
-    for P, _ in islice(_doubled_as_told(A, C, Q, R), _SCALING):
-        spread = np.sqrt(np.diag(P))
-    # Powers of two change no digit.
-    unit = 2.0 ** np.round(np.log2(np.where(spread > 0, spread, 1.0)))
-    units = np.outer(unit, unit)
-    for P, more in _doubled_as_told(A * unit / unit[:, None], C * unit, Q / units, R):
-        yield P * units, more * units
-
-
-def _doubled_as_told(A: Array, C: Array, Q: Array, R: Array) -> Iterator[tuple[Array, Array]]:
-    """The same with the numbers as they are.
+    """P after 2, 4, 8, ... samples, and by how much it grew, until numbers overflow; in any units of the states.
 
     Source: Chu, Fan, Lin and Wang, Int. J. Control 77 (2004): structure-preserving doubling, which converges
     quadratically.
     """
-    I = np.eye(len(A))
-    F, G, P = A.T, C.T @ np.linalg.solve(R, C), Q
+    unit: Array = np.ones(len(A))
+    I, F, G, P = np.eye(len(A)), A.T, C.T @ np.linalg.solve(R, C), Q
     with np.errstate(all="ignore"):
-        for _ in range(_ROUNDS):
+        for rounds in range(_ROUNDS):
+            if rounds == _SCALING:  # on in units of how far states go; powers of two change no digit
+                spread = np.sqrt(np.diag(P))
+                unit = 2.0 ** np.round(np.log2(np.where(spread > 0, spread, 1.0)))
+                F, G, P = F * unit[:, None] / unit, G * np.outer(unit, unit), P / np.outer(unit, unit)
             try:
                 solved = np.linalg.solve(I + G @ P, np.hstack([F, G]))
             except np.linalg.LinAlgError:
@@ -80,4 +71,4 @@ def _doubled_as_told(A: Array, C: Array, Q: Array, R: Array) -> Iterator[tuple[A
             P, G, F = P + (more_P + more_P.T) / 2, G + (more_G + more_G.T) / 2, F @ W
             if not np.isfinite(P).all():
                 return
-            yield P, more_P
+            yield P * np.outer(unit, unit), more_P * np.outer(unit, unit)
