@@ -92,3 +92,27 @@ def test_many_nines_are_a_mark(tmp_path):
     export = read(tmp_path, text(rows(y=y)))
     assert [len(record) for record in export.records] == [5, 6]
     assert told(export, "1e+08")
+
+
+def test_rows_of_one_column_each_are_put_together(tmp_path):
+    lines = [line for time, u, y in rows() for line in ([time, u, ""], [time, "", y])]
+    export = read(tmp_path, text(lines))
+    assert_whole(export)
+    assert told(export, "times stand more than once")
+
+
+@pytest.mark.parametrize("form", ["{} Uhr", "{} GMT+0200", "{} UTC+02:00", "{}+02:00[Europe/Berlin]"])
+def test_words_behind_a_time(tmp_path, form):
+    assert_whole(read(tmp_path, text(rows([form.format(time) for time in STAMPS]))))
+
+
+@pytest.mark.parametrize("good", ["192 - Good", "192: GOOD", "00 Good"])
+def test_a_number_before_good_keeps_it_good(tmp_path, good):
+    lines = [[*row, good if k != 5 else "24 - Bad"] for k, row in enumerate(rows())]
+    export = read(tmp_path, text(lines, header=("time", "u", "y", "y.q")))
+    assert [len(record) for record in export.records] == [5, 6]
+
+
+def test_a_dash_for_a_minus(tmp_path):
+    [record] = read(tmp_path, text(rows(y=[f"–{value}" for value in Y]))).records
+    np.testing.assert_array_equal(record.y[:, 0], -Y)

@@ -30,6 +30,7 @@ HALVES = re.compile(
     r"\s*\b(?:([ap])\.\s?m\b\.?)|\s*(?:(上午|午前|오전|π\.?μ\.?)|(下午|午後|오후|μ\.?μ\.?))\s*", re.IGNORECASE
 )
 HOUR = re.compile(r"(?<!\d)\d{1,2}:\d\d(:\d\d([.,]\d+)?)?")
+TAIL = re.compile(r"\s*(Uhr|\[[\w/+-]+\])$|\s?(UTC|GMT)(?=[+-]\d)")
 OF = re.compile(r"(?<=\w )(de|del) (?=\w)")
 DAY = re.compile(r"^(\d{1,2})\. ?(?=[^\W\d_])")
 
@@ -42,6 +43,7 @@ def plain_date(stamp: str) -> str:
     """
     if not any(map(str.isalpha, stamp)):
         return OFFSET.sub(r"\1\2", stamp)
+    stamp = TAIL.sub("", stamp)
     half = HALVES.search(stamp)
     if half:
         name = "AM" if half[2] or (half[1] or "").casefold() == "a" else "PM"

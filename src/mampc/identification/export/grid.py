@@ -227,7 +227,7 @@ def _each_once(
         places = rows_text(sorted(set(contradicting)))
         verb = "contradicts" if len(set(contradicting)) == 1 else "contradict"
         findings.change(f"{places} {verb} another row of the same time; neither is used")
-    if len(repeated) > MOST_UNEVEN * len(first):
+    if contradicting and len(repeated) > MOST_UNEVEN * len(first):
         findings.doubt(
             f"expected a time for each sample, received {len(repeated)} of {len(first)} times more than once, first in "
             f"row {min(rows)}; export times with more digits"

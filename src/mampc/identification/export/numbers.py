@@ -26,6 +26,7 @@ APART = re.compile(r"[+-]?\d{1,3}( \d{3})+([.,]\d*)?", re.ASCII)
 APART_FOR_SURE = re.compile(r"[+-]?\d{1,3}(( \d{3})+[.,]\d*|( \d{3}){2,})", re.ASCII)
 SPACED = re.compile(rf"[+-]?\d{{1,3}}({SPACE.pattern}\d{{3}})+(\.\d*)?", re.ASCII)
 EITHER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # 1,234: grouped thousands, or three decimals
+MINUS = str.maketrans("−–", "--")
 DIGIT = re.compile(r"\d")
 # Words that programs write in the place of a value with digits in them; a word without digits never is a number.
 MARK = re.compile(
@@ -132,7 +133,7 @@ def read_numbers(
 
 def clean(cell: str) -> str:
     """A cell without spaces around it, with a plain minus sign, and E for Fortran's D."""
-    word = cell.strip().replace("−", "-")
+    word = cell.strip().translate(MINUS)
     found = FORTRAN.fullmatch(word)
     return f"{found[1]}E{found[2]}" if found else word
 

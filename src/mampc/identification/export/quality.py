@@ -28,7 +28,7 @@ TRUE_OR_FALSE = frozenset({"true", "false", "0", "1", "yes", "no", ""})
 GOOD = frozenset({"good", "g", "ok", "valid", "normal", "raw", "gut", "bon", "true", "yes"})
 # Behind "good", such as "Good, Annotated" or "Good [Non-Specific]", what does not take it back.
 STILL_GOOD = re.compile(
-    r"(\d+ )?(good|gut|bon|ok)\b(?!.*\b(not|bad|questionable|uncertain|suspect|stale|substituted)\b).*"
+    r"(\d+[ :-]+)?(good|gut|bon|ok)\b(?!.*\b(not|bad|questionable|uncertain|suspect|stale|substituted)\b).*"
 )
 SPOKEN = re.compile(
     r"(good|bad|uncertain|questionable|gut|schlecht|bon|mauvais)\b.*"
