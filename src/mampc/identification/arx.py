@@ -1,4 +1,4 @@
-"""The rival: for every output an ARX model by plain least squares.
+"""A rival: for every output an ARX model by plain least squares.
 
 Only its poles are kept; inputs, constants and integrators are then found as for any other model.
 

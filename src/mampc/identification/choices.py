@@ -15,6 +15,7 @@ from mampc.identification.arx import estimate_arx
 from mampc.identification.closed_loop import estimate_predictor
 from mampc.identification.delays import Integers, find_delays
 from mampc.identification.estimate import Settings, estimate
+from mampc.identification.fir import estimate_fir
 from mampc.identification.held_out import AS_GOOD, CLEARLY, RIVAL, WALK, compared, errors, split
 from mampc.identification.parts import Part, groups
 from mampc.identification.scaling import Scaled
@@ -29,22 +30,23 @@ TRENDS = {
 COLOUR = {"whitened": -2, "differences": -1}  # which to take first where the disturbance is not white
 ENOUGH = 20_000  # samples in which choices are compared
 SHORT = 3  # samples of dead time that are left to the states
+RIVALS = ("ARX", "FIR")  # for the poles of subspace models
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What is estimated: the trend, the dead times (l, m), and whether by the rival or from predictors."""
+    """What is estimated: the trend, the dead times (l, m), whose poles, and whether from predictors."""
 
     trend: str
     delays: Integers
-    rival: bool = False
+    poles: str = "subspace"  # or one of `RIVALS`
     predictor: bool = False
     notes: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         late = "with dead times" if self.delays.any() else "without dead times"
-        return f"{'ARX' if self.rival else 'subspace'} models, trend: {self.trend}, {late}"
+        return f"{self.poles} models, trend: {self.trend}, {late}"
 
 
 class Score(NamedTuple):
@@ -67,8 +69,10 @@ def estimated(
     """The parts of a model, of given orders if any; appends the singular values of each."""
     if choice.predictor:
         return [estimate_predictor(records, settings.feedthrough, None if orders is None else orders[0])[0]]
-    if choice.rival or choice.trend == "whitened":
+    if choice.poles == "ARX" or choice.trend == "whitened":
         return estimate_arx(records, choice.delays, settings, choice.trend, orders)
+    if choice.poles == "FIR":
+        return estimate_fir(records, choice.delays, settings, choice.trend, orders)
     parts = []
     for k, (outputs, delays) in enumerate(groups(choice.delays)):
         fixed = settings if orders is None else replace(settings, order=orders[k])
@@ -161,12 +165,15 @@ def chosen(
                 f"Dead times of {spans} samples; they predict held-out data {compared(score, without)} none."
             )
     if settings.order is None and choice.trend != "whitened":
-        rival = scored(replace(choice, rival=True)).error
-        wins = rival < score - RIVAL
-        choice = replace(choice, rival=wins)
-        poles, other = ("ARX", "subspace") if wins else ("Subspace", "ARX")
-        said = compared(min(rival, score) if wins else score, score if wins else rival)
-        notes.append(f"{poles} poles; they predict held-out data {said} {other} ones.")
+        rivals = {poles: scored(replace(choice, poles=poles)).error for poles in RIVALS}
+        best_rival = min(RIVALS, key=lambda poles: rivals[poles])
+        if rivals[best_rival] < score - RIVAL:
+            choice = replace(choice, poles=best_rival)
+            own, rivals = rivals.pop(best_rival), rivals | {"subspace": score}
+        else:
+            own = score
+        said = " and ".join(f"{compared(own, error)} {poles} ones" for poles, error in rivals.items())
+        notes.append(f"{choice.poles[0].upper()}{choice.poles[1:]} poles; they predict held-out data {said}.")
     return replace(choice, notes=tuple(notes))
 
 
