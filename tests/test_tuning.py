@@ -12,15 +12,17 @@ from builders import tank_model
 from mampc.cli import app
 from mampc.compare import candidates, promise, scenarios, tuning
 from mampc.compare.fronts import Point
-from mampc.compare.scenarios import even_weight, scenario_length, settling, usual_problem
+from mampc.compare.rounds import Rounds
+from mampc.compare.scenarios import even_weight, scenario_length
 from mampc.compare.tuned_study import study_of_model, with_tuning
 from mampc.program.condensing import CondensedQP
+from mampc.program.usual import dead_samples, settling, usual_problem
 from mampc.study import load_study, parse_study
 from mampc.study.regulators import regulator_of
 from mampc.study.running import run_study
 from mampc.study.writing import study_text
 
-SMALL = tuning.Rounds(3, 3, 4, 4, 8)
+SMALL = Rounds(3, 3, 4, 4, 8)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -111,14 +113,12 @@ def test_the_price_aimed_at_is_the_highest_that_keeps_the_allowance_or_one_beyon
 
 
 def test_the_price_is_the_one_nearest_to_what_is_allowed():
-    class Line:
-        def points(self, prices, scenarios):
-            return [Point("", price, np.ones(8), np.full(8, price)) for price in prices]
+    def run(price):
+        return Point("", price, np.ones(8), np.full(8, price))
 
     base, goal = in_turn(1.0)[1], promise.Goal(0.25, None)
     for begun in (0.5, 1.1, 1.2, 3.0):
-        work = tuning.Work(SMALL, 1, False, lambda *_: None)
-        price, _, kept = tuning._nearest(goal, begun, Line(), range(8), base, work)
+        price, _, kept = tuning._nearest(goal, begun, run, base)
         assert kept
         assert price <= 1.25
         assert price > 1.0 or begun == 0.5  # a few steps up at most
@@ -199,6 +199,8 @@ def test_the_horizon_covers_what_step_responses_take_to_settle():
     assert settling(lag()) == pytest.approx(50 / 10 * np.log(20), abs=1)
     assert settling(lag(dead_time=80.0)) == settling(lag()) + 8
     assert settling(lag(time_constant=np.inf)) <= 2
+    position = mampc.StateSpace([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]], None, 1.0)
+    assert dead_samples(position) == 0  # the response grows as the square of time
     problem = usual_problem(lag(dead_time=80.0), mampc.Limits(), 1.0)
     assert problem.prediction_horizon == settling(lag()) + 8
     far = usual_problem(lag(dead_time=600.0), mampc.Limits(u_min=-1.0, u_max=1.0), 1.0)

@@ -171,7 +171,8 @@ def _own_study(path: Path, model: Path) -> str:
     inside = place.is_relative_to(folder)
     file = place.relative_to(folder).as_posix() if inside else str(place)
     try:
-        text = own_study(loaded, file, path.stem[:80])
+        with progress() as show:
+            text = own_study(loaded, file, path.stem[:80], show)
     except MampcError as error:
         raise MampcError(f"{model}: {error}") from None
     parse_study(text, str(path), folder=folder)

@@ -19,6 +19,7 @@ from mampc.moves.rules import MoveRules
 from mampc.program.problem import TrackingProblem
 
 MOVE_WEIGHTS = (0.1, 0.3, 1.0)  # times those of plain MPC
+USUAL_WEIGHT = 0.3  # alone where zones make runs dear
 TAILS = (0.0, 0.25)  # times the prediction horizon
 PULLS = (0.0, 0.1)  # to the middle of zones, where plain MPC has none
 CONTROL_HORIZONS = (2, 3)  # fewest and most samples; with one alone, plans cannot aim and catch
@@ -65,7 +66,8 @@ def candidates(problem: TrackingProblem, noise: Array, guessed: bool = False) ->
     n_c = min(int(np.clip(MOST_MOVES // m, *CONTROL_HORIZONS)), n_p)
     estimator, found = LoadBank(problem.model, noise=noise, guessed=guessed), []
     pulls = PULLS if problem.zoned.any() and problem.zone_pull == 0 else (problem.zone_pull,)
-    for share, tail, pull in product(MOVE_WEIGHTS, TAILS, pulls):
+    weights = (USUAL_WEIGHT,) if problem.zoned.any() else MOVE_WEIGHTS
+    for share, tail, pull in product(weights, TAILS, pulls):
         sparse = replace(
             problem, control_horizon=n_c, move_weight=share * problem.move_weight, tail_horizon=tail * n_p,
             zone_pull=pull,

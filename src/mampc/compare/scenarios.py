@@ -20,17 +20,10 @@ from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.loads import Coloured, Load, RandomSteps, RandomWalk, drawn
 from mampc.loop.regulator import Regulator
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.usual import dead_samples, usual_problem
 from mampc.systems.mismatch import Mismatch
 from mampc.systems.noise import white_noise
-from mampc.systems.properties import growth, samples_to_grow
 from mampc.systems.state_space import StateSpace
-
-SETTLED = 0.05  # share of a step response's largest value that may be missing where it has settled
-LONGEST_SETTLING = 500  # samples that are looked at
-HORIZONS = (10, 60)  # fewest and most samples of a prediction horizon; dead times come on top of the most
-BEGUN = 1e-3  # share of a step response's largest value up to which it is dead time
-FREE_MOVES = 5  # control horizon of plain MPC
-CONDITION = 500.0  # of the program that the move weight of plain MPC aims at, as in dynamic matrix control
 
 LEAST_GAIN = 1e-3  # of the largest: directions that answer less are not asked for
 CHANGE = 10.0  # times the noise: how far set-points go, either way
@@ -108,57 +101,11 @@ def every_kind(model: StateSpace, noise: Array, samples: int) -> tuple[tuple[Loa
     )
 
 
-def usual_problem(model: StateSpace, limits: Limits, output_weight: Any) -> TrackingProblem:
-    """Plain MPC of a model: the prediction horizon covers what step responses take to settle, in bounded samples.
-
-    What lies behind the longest dead time has to be within it, or no move pays.
-
-    The move weight of an input is the curvature of its first move over 500 / nc, with nc the control horizon.
-
-    Source of the latter: Shridhar and Cooper, Ind. Eng. Chem. Research 36 (1997).
-    """
-    shortest, longest = HORIZONS
-    n_p = int(np.clip(settling(model), shortest, longest + dead_samples(model)))
-    n_c = min(FREE_MOVES, n_p)
-    settings = {"prediction_horizon": n_p, "control_horizon": n_c, "output_weight": output_weight}
-    problem = TrackingProblem(model, **settings, move_weight=1.0, limits=limits)
-    response = model.step_response(n_p + 1)[:, :, : model.n_inputs]
-    curvature = np.einsum("kij,ia,kaj->j", response, problem.output_weight, response)
-    curvature = np.where(curvature > 0, curvature, curvature.max() or 1.0)
-    return replace(problem, move_weight=curvature * n_c / CONDITION)
-
-
 def even_weight(model: StateSpace, limits: Limits) -> Array:
     """Q of outputs whose errors count alike beside their noise, shape (l,), with 1 for one output or equal noises."""
     noise = Surroundings.of(usual_problem(model, limits, 1.0), None, None, None).noise
     weight: Array = (np.exp(np.log(noise).mean()) / noise) ** 2
     return weight
-
-
-def settling(model: StateSpace) -> int:
-    """Samples until every step response stays where it leads; of models that integrate, until its slope does; of
-    unstable ones, until errors have grown tenfold.
-    """
-    growing = samples_to_grow(model)
-    if growing is not None:
-        return min(growing, LONGEST_SETTLING)
-    response = model.step_response(LONGEST_SETTLING + 1)[:, :, : model.n_inputs]
-    if np.abs(model.poles()).max(initial=0.0) > 1 - 1e-6:
-        response = np.diff(response, axis=0)
-    if not np.isfinite(response).all():
-        return 0
-    off = np.abs(response - response[-1]) > SETTLED * np.abs(response).max(axis=0)
-    return int(np.flatnonzero(off.any(axis=(1, 2))).max(initial=-1)) + 1
-
-
-def dead_samples(model: StateSpace) -> int:
-    """The longest dead time of an output and an input that moves it, in samples."""
-    response = np.abs(model.step_response(LONGEST_SETTLING + 1)[:, :, : model.n_inputs])
-    if not np.isfinite(response).all():
-        return 0
-    response /= growth(model) ** np.arange(len(response))[:, None, None]
-    begun = (response > BEGUN * response.max(axis=0)).argmax(axis=0)
-    return int(max(begun.max(initial=0) - 1, 0))
 
 
 def scenario_length(problem: TrackingProblem) -> int:

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError
-from mampc.base.progress import watched
 from mampc.compare.candidates import Candidate, candidates
 from mampc.compare.fronts import Estimate, Point, non_dominated
 from mampc.compare.promise import Expected, Goal, error_ratio, moves_per_hour
-from mampc.compare.scenarios import Scenarios, Surroundings, usual_problem
+from mampc.compare.rounds import DEAR_ROUNDS, FINALISTS, HIGHER, ROUNDS, Work
+from mampc.compare.scenarios import Scenarios, Surroundings
 from mampc.controllers import MAMPC, MPC, ControllerBank
 from mampc.loop.estimator import Estimator
 from mampc.loop.kalman_filter import KalmanFilter
@@ -27,51 +27,12 @@ from mampc.loop.load_bank import LoadBank
 from mampc.loop.regulator import Regulator
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.usual import usual_problem
 from mampc.systems.state_space import StateSpace, as_discrete
 
-
-class Rounds(NamedTuple):
-    """How many scenarios are run: of the search and its second round with how many prices, and of the confirmation."""
-
-    searched: int
-    search_prices: int
-    refined: int
-    refine_prices: int
-    confirmed: int
-
-
-ROUNDS = Rounds(8, 6, 16, 11, 64)
-DEAR_ROUNDS = Rounds(4, 4, 8, 5, 16)  # where loops are stepped one by one
 SEARCH_SPAN = (3e-3, 3.0)  # prices over the error of plain MPC in a prediction horizon
 REFINE_SPAN = 4.0  # prices up and down from where the first round led
-FINALISTS = 2
-HIGHER = 3  # times that the price of a finalist goes up where it keeps what is allowed
 STEPS = (1, 2, 3, -1, -2, -3, *range(4, 16))  # it goes back where it does not, below zero up
-
-
-class Work:
-    """How many closed loops are done, told as they are."""
-
-    def __init__(
-        self, counts: Rounds, candidates: int, progress: bool | None, on_task: Callable[[int, int], None]
-    ) -> None:
-        searched = counts.searched * (1 + candidates * counts.search_prices)
-        refined = counts.refined * (1 + min(FINALISTS, candidates) * counts.refine_prices)
-        self.total = searched + refined + counts.confirmed * (2 + HIGHER)
-        self.done = 0
-        self._bar, self._on_task = iter(watched(self.total, progress)), on_task
-
-    def add(self, loops: int) -> None:
-        """So many more are done; confirmation may need more than was foreseen."""
-        for _ in range(min(loops, self.total - self.done)):
-            next(self._bar, None)
-        self.done = min(self.done + loops, self.total)
-        self._on_task(self.done, self.total)
-
-    def end(self) -> None:
-        """All are done."""
-        self.add(self.total - self.done)
-        next(self._bar, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +201,7 @@ def tune(
         [base, *(point for *_, points in finalists for point in points)], base.method, second.hours
     )
     last, last_base = _drawn(plain, around, counts.confirmed, (seed, 3), work)
-    chosen, price, point, reached = _confirmed(goal, finalists, last, last_base, work)
+    chosen, price, point, reached = _confirmed(goal, finalists, last, last_base, jobs, work)
     work.end()
     expected = Expected.of(point, last_base, goal, around.loads)
     front: tuple[FrontPoint, ...] = ()
@@ -324,12 +285,18 @@ def _run(
 
 
 def _confirmed(
-    goal: Goal, finalists: Sequence[Any], scenarios: Scenarios, base: Point, work: Work
+    goal: Goal, finalists: Sequence[Any], scenarios: Scenarios, base: Point, jobs: int, work: Work
 ) -> tuple[Candidate | None, float, Point, bool]:
     """The first finalist that keeps what is allowed in scenarios that it was not chosen by; else the calmest."""
     calmest: tuple[Candidate | None, float, Point] = (None, 0.0, base)
     for _, price, candidate, _ in finalists:
-        price, point, kept = _nearest(goal, price, candidate, scenarios, base, work)
+
+        def run(price: float, candidate: Candidate = candidate) -> Point:
+            point = _at_price(candidate, price, scenarios, jobs)
+            work.add(len(scenarios))
+            return point
+
+        price, point, kept = _nearest(goal, price, run, base)
         if kept and point.moves.mean() < base.moves.mean():
             return candidate, price, point, True
         if goal.max_error_increase is None and point.moves.mean() < calmest[2].moves.mean():
@@ -337,34 +304,43 @@ def _confirmed(
     return *calmest, False
 
 
+def _at_price(candidate: Candidate, price: float, scenarios: Scenarios, jobs: int) -> Point:
+    """The runs of one price; in parallel where each is dear."""
+    if jobs == 1 or not candidate.problem.zoned.any():
+        return candidate.points([price], scenarios)[0]
+    from joblib import Parallel, delayed
+
+    loops = range(len(scenarios))
+    each = Parallel(n_jobs=jobs, max_nbytes=None)(
+        delayed(candidate.points)([price], scenarios.only([loop])) for loop in loops
+    )
+    runs = [point for (point,) in each]
+    moves, error = (np.concatenate([getattr(point, name) for point in runs]) for name in ("moves", "error"))
+    return Point(candidate.name, price, moves, error)
+
+
 def _nearest(
-    goal: Goal, price: float, candidate: Candidate, scenarios: Scenarios, base: Point, work: Work
+    goal: Goal, price: float, run: Callable[[float], Point], base: Point
 ) -> tuple[float, Point, bool]:
     """A price from which one step further would use more than is allowed, its runs, and whether it keeps that.
 
     One that keeps it is raised a few times, as long as it does; for another, ever farther ones are tried.
     """
-
-    def run(price: float) -> tuple[Point, bool]:
-        (point,) = candidate.points([price], scenarios)
-        work.add(len(scenarios))
-        return point, goal.keeps(point, base)
-
-    point, kept = run(price)
-    if kept:
+    point = run(price)
+    if goal.keeps(point, base):
         for _ in range(HIGHER):
-            further, kept = run(price / goal.back)
-            if not kept:
+            further = run(price / goal.back)
+            if not goal.keeps(further, base):
                 break
             price, point = price / goal.back, further
         return price, point, True
     tried = price
     for steps in STEPS:
         tried = price * goal.back**steps
-        point, kept = run(tried)
-        if kept:
-            break
-    return tried, point, kept
+        point = run(tried)
+        if goal.keeps(point, base):
+            return tried, point, True
+    return tried, point, False
 
 
 def _front(points: Sequence[Point], base: Point, goal: Goal) -> tuple[FrontPoint, ...]:

@@ -15,6 +15,7 @@ from mampc.program.steady import SteadyTarget
 from mampc.study.schema import Study
 
 MISSED = 0.05  # of an output's largest change of reference: what inputs within their limits may leave
+ROUNDING = 1e-6  # of the largest change, as outputs weigh: what an output that is to stay may miss by
 MOST_LEVELS = 50  # different references that are looked at
 
 
@@ -80,11 +81,13 @@ def _out_of_reach(condensed: CondensedQP, levels: Array, zones: TrackingProblem)
         reached = target.at(parameter.vector(np.zeros(model.n_states), u_op, level)).y
         apart = reached - level
         worst = np.maximum(worst, np.maximum(apart - zones.zone_above, -apart - zones.zone_below))
+    unit = np.sqrt(np.diag(problem.output_weight))
+    counts = unit * worst > ROUNDING * (unit * change).max()
     return [
         f"the reference of {name} is up to {missed:.3g} away from what the inputs can hold within their limits, by the "
         "model; widen the limits or move it"
-        for name, missed, largest in zip(model.names.outputs, worst, change, strict=True)
-        if missed > MISSED * largest
+        for name, missed, largest, more in zip(model.names.outputs, worst, change, counts, strict=True)
+        if more and missed > MISSED * largest
     ]
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from mampc.base.checks import Array
+from mampc.base.checks import Array, BoolArray
 from mampc.base.errors import MampcError, listed
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
@@ -22,13 +23,12 @@ from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.regulator import Regulator
 from mampc.loop.simulation import simulate
 from mampc.moves.rules import MoveRules
-from mampc.program.condensing import CondensedQP
-from mampc.program.problem import MOST_PREDICTIONS, Limits, TrackingProblem
-from mampc.systems.properties import Properties, properties, samples_to_grow, time_in_words
+from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.usual import dead_samples, usual_problem
+from mampc.systems.properties import Properties, properties, time_in_words
 from mampc.systems.state_space import StateSpace
 
-LONGEST_HORIZON = 100  # samples; beyond it the tail counts
-SHORTEST_HORIZON = 10
+CHANGE_LASTS = (20, 200)  # fewest and most samples that a change of reference lasts, dead times aside
 ASKED = 0.3  # of what inputs can hold: the change of reference
 GUESSED_NOISE = 0.02  # of that change, where no record told
 MOST_CHANGES = 4  # of single outputs
@@ -38,7 +38,8 @@ LITTLE = 1.25  # times the error of plain MPC
 TRIED = 12  # planned moves, up to which prices are tried in a moment
 DEAD_BAND = 0.01  # of the inputs' range
 LARGEST_WEIGHT = 1e9
-EFFORT = 0.1  # of the error that an input's change makes, in one sample: what its move costs
+LEVEL_TAKES = 20  # samples behind dead times in which a level goes as far as all its inputs can move it
+PLANNED = {1: 5, 2: 5, 3: 4}  # samples with moves, of so many inputs; 3 of more
 
 
 class Draft(NamedTuple):
@@ -54,60 +55,61 @@ class Draft(NamedTuple):
     known_noise: bool
 
 
-def own_study(model: StateSpace, file: str, name: str) -> str:
+def own_study(
+    model: StateSpace, file: str, name: str, on_stage: Callable[[str], None] = lambda stage: None
+) -> str:
     """The commented text of a study of a model, which stands in for the plant.
 
     Args:
         model: discrete.
         file: of the model, as the study names it.
         name: of the study.
+        on_stage: called when a stage begins.
 
     Raises:
         MampcError: a continuous model, or one whose outputs no input moves.
     """
     found = properties(model)
-    return _text(model, found, draft(model, found), file, name)
+    return _text(model, found, draft(model, found, on_stage), file, name)
 
 
-def draft(model: StateSpace, found: Properties) -> Draft:
+def draft(
+    model: StateSpace, found: Properties, on_stage: Callable[[str], None] = lambda stage: None
+) -> Draft:
     """Limits, horizons, weights, reference, price and noise."""
     low, high, known = _input_limits(model)
     m, l = model.n_inputs, model.n_outputs
-    settling = int(np.ceil(found.settling_time / model.dt))
-    dead = int(np.ceil(found.dead_time[:, :m].max(initial=0.0) / model.dt))
-    moves = 5 if m < 3 else 4 if m == 3 else 3
-    horizon = min(max(settling, SHORTEST_HORIZON), LONGEST_HORIZON)
-    growing = samples_to_grow(model)
-    if growing is not None:
-        horizon = min(horizon, max(growing, SHORTEST_HORIZON))
-    horizon = min(max(horizon, dead + 2 * moves), MOST_PREDICTIONS // l)
-    gain = _held_gain(model, found, horizon)
+    limits = Limits(u_min=low, u_max=high)
+    horizon = usual_problem(model, limits, 1.0).prediction_horizon
+    gain, integrates = _held_gain(model, found, min(horizon, LEVEL_TAKES + dead_samples(model)))
     if not gain.any():
         raise MampcError("expected a model whose inputs move an output, received one where none does")
-    changes = _reachable(gain, model.u_op - low, high - model.u_op)
+    changes = _reachable(gain, integrates, model.u_op - low, high - model.u_op)
     asked = np.abs(changes).max(axis=0)
     # Outputs that none of the changes concerns weigh as little as what inputs do to them says.
     asked = np.where(asked > 0, asked, np.maximum((np.abs(gain) @ (high - low)) * ASKED, 1e-300))
     output_weight: Array = 1 / np.where(asked > 1e-300, asked, 1.0) ** 2
-    move_weight = _positive(EFFORT * output_weight @ gain**2)
+    problem = usual_problem(model, limits, output_weight)
+    move_weight = np.diag(problem.move_weight)
     # Only ratios matter, and a study's numbers are bounded.
     within = min(1.0, LARGEST_WEIGHT / max(output_weight.max(), move_weight.max()))
-    output_weight, move_weight = _rounded(within * output_weight), _rounded(within * move_weight)
-    tail = 0.0 if found.unstable else float(horizon)  # what grows has no tail
-    problem = TrackingProblem(
-        model, prediction_horizon=horizon, control_horizon=min(moves, horizon), output_weight=output_weight,
-        move_weight=move_weight, limits=Limits(u_min=low, u_max=high), tail_horizon=tail,
+    horizon = problem.prediction_horizon
+    problem = replace(
+        problem, control_horizon=min(PLANNED.get(m, 3), horizon), output_weight=_rounded(within * output_weight),
+        move_weight=_rounded(within * move_weight), tail_horizon=0.0 if found.unstable else float(horizon),
     )  # fmt: skip
-    problem = _stable(problem)
     known_noise = model.noise is not None and bool((model.noise.output > 0).any())
     noise = model.noise.output if known_noise and model.noise is not None else GUESSED_NOISE * asked
-    every = min(max(int(1.5 * settling) + dead, 20), 2 * LONGEST_HORIZON)
+    settling, dead = int(np.ceil(found.settling_time / model.dt)), dead_samples(model)
+    every = int(np.clip(1.5 * max(settling - dead, horizon - dead), *CHANGE_LASTS)) + 2 * dead
     highest = highest_price(problem, changes)
-    usual = _usual_price(problem, np.vstack([changes, np.zeros(l)]), every, highest)
+    usual = _usual_price(problem, np.vstack([changes, np.zeros(l)]), every, highest, on_stage)
     return Draft(problem, changes, every, highest, usual, _rounded(noise), known, known_noise)
 
 
-def _usual_price(problem: TrackingProblem, changes: Array, every: int, highest: float) -> float:
+def _usual_price(
+    problem: TrackingProblem, changes: Array, every: int, highest: float, on_stage: Callable[[str], None]
+) -> float:
     """The highest of some prices with which the changes, without noise, come out nearly as with plain MPC.
 
     What a price costs after a change is foreseen by `highest_price`; not how far outputs may go astray while they
@@ -123,9 +125,11 @@ def _usual_price(problem: TrackingProblem, changes: Array, every: int, highest: 
         return float(np.einsum("ti,ij,tj->", run.y - run.r, problem.output_weight, run.y - run.r))
 
     most = LITTLE * error(MPC(problem))
-    return next(
-        (price for price in prices if error(MAMPC(problem, MoveRules(price=price))) <= most), prices[-1]
-    )
+    for number, price in enumerate(prices, 1):
+        on_stage(f"trying price {number} of {len(prices)} at most")
+        if error(MAMPC(problem, MoveRules(price=price))) <= most:
+            break
+    return price
 
 
 def _input_limits(model: StateSpace) -> tuple[Array, Array, bool]:
@@ -139,28 +143,49 @@ def _input_limits(model: StateSpace) -> tuple[Array, Array, bool]:
             step = 10.0 ** np.floor(np.log10(span) - 2)
             return np.floor(low / step) * step, np.ceil(high / step) * step, True
     span = np.where(model.u_op == 0, 1.0, np.abs(model.u_op) / 2)
-    return model.u_op - span, model.u_op + span, False
+    step = 10.0 ** np.floor(np.log10(span) - 1)
+    return np.floor((model.u_op - span) / step) * step, np.ceil((model.u_op + span) / step) * step, False
 
 
-def _held_gain(model: StateSpace, found: Properties, horizon: int) -> Array:
-    """What held inputs do, (l, m): steady; over the horizon where an output integrates."""
+def _held_gain(model: StateSpace, found: Properties, samples: int) -> tuple[Array, BoolArray]:
+    """What held inputs do, (l, m), and which outputs integrate: steady, or after so many samples for these."""
     m = model.n_inputs
-    gain = found.gain
+    gain = found.gain[:, :m]
     if found.unstable and not found.integrators:
-        gain = model.dc_gain()  # of the steady state that a controller can hold
+        gain = model.dc_gain()[:, :m]  # of the steady state that a controller can hold
     gain = np.where(np.isfinite(gain), gain, 0.0)
-    rows = found.integrating.any(axis=1, keepdims=True)
-    held: Array = np.where(rows, np.where(found.integrating, gain * horizon * model.dt, 0.0), gain)[:, :m]
-    return held
+    integrating = found.integrating[:, :m]
+    rows: BoolArray = np.any(integrating, axis=1)
+    moved = np.where(integrating, model.step_response(samples + 1)[-1, :, :m], 0.0)
+    held: Array = np.where(rows[:, None], moved, gain)
+    return held, rows
 
 
-def _reachable(gain: Array, down: Array, up: Array) -> Array:
+def _reachable(gain: Array, integrates: BoolArray, down: Array, up: Array) -> Array:
     """Changes of one output each, as far as inputs can hold them; where that is not possible, what one input does.
 
+    Outputs that integrate rest at any level, and only with inputs that leave them where they are.
+
     Args:
-        gain: of `_held_gain`.
+        gain, integrates: of `_held_gain`.
         down, up: how far each input can go, shape (m,).
     """
+    if integrates.any():
+        room = np.maximum(down, up)
+        levels = np.diag(ASKED * np.abs(gain * room).max(axis=1))[integrates]
+        scaled = gain[integrates] * room
+        scaled = scaled / np.abs(scaled).max(axis=1, keepdims=True)
+        resting = gain - gain * room @ np.linalg.pinv(scaled) @ scaled / room
+        resting = np.where(
+            np.abs(resting) * room > 1e-9 * np.abs(gain * room).max(axis=1, keepdims=True), resting, 0.0
+        )
+        resting[integrates] = 0.0
+        rest = (
+            _reachable(resting, np.zeros_like(integrates), down, up)
+            if resting.any()
+            else np.zeros((0, len(gain)))
+        )
+        return np.vstack([_rounded(levels), rest])[:MOST_CHANGES]
     l, m = gain.shape
     room = np.minimum(down, up)
     room = np.where(room > 0, room, np.maximum(down, up))
@@ -194,34 +219,11 @@ def _reach(change: Array, down: Array, up: Array) -> float:
     return float(times.min())
 
 
-def _stable(problem: TrackingProblem) -> TrackingProblem:
-    """With moves that cost more and a longer horizon, as far as it takes a closed loop that is stable without limits.
-
-    A plant that first answers in the wrong direction wants a horizon that sees the right one.
-    """
-    longest = min(LONGEST_HORIZON, MOST_PREDICTIONS // problem.model.n_outputs)
-    for _ in range(8):
-        if np.abs(CondensedQP(problem).closed_loop_poles()).max() < 1 + 1e-6:
-            break
-        horizon = max(problem.prediction_horizon, min(int(1.5 * problem.prediction_horizon), longest))
-        problem = TrackingProblem(
-            problem.model, prediction_horizon=horizon, control_horizon=problem.control_horizon,
-            output_weight=problem.output_weight, move_weight=_rounded(4 * problem.move_weight),
-            limits=problem.limits, tail_horizon=float(horizon) if problem.tail_horizon else 0.0,
-        )  # fmt: skip
-    return problem
-
-
 def _rounded(values: Array, digits: int = 2) -> Array:
     """To so many digits each."""
     flat = [float(f"{value:.{digits}g}") for value in np.ravel(values)]
     rounded: Array = np.reshape(flat, np.shape(values))
     return rounded
-
-
-def _positive(values: Array) -> Array:
-    """Zeros, of inputs that do nothing, replaced by the largest of the others."""
-    return np.where(values > 0, values, values.max(initial=0.0) or 1.0)
 
 
 def _text(model: StateSpace, found: Properties, plan: Draft, file: str, name: str) -> str:
