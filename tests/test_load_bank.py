@@ -63,6 +63,23 @@ def test_where_all_is_detectable_doubling_solves_the_riccati_equation(seed):
         np.testing.assert_allclose(covariance(*arguments), expected, rtol=1e-8)
 
 
+def test_a_jump_is_found_behind_long_dead_times():
+    model = mampc.StateSpace.from_first_order(
+        gain=[[1.0, -0.9], [0.9, 1.0]],
+        time_constant=np.full((2, 2), 5.0),
+        dead_time=[[50, 10], [10, 50]],
+        dt=1.0,
+    )
+    member = Member(HYPOTHESES[-1], Loads.of(model, np.full(2, 0.05)))
+    A, C, K = member.A, member.C, member.gain(np.ones(2, dtype=bool))
+    z, z_hat = np.zeros(len(A)), np.zeros(len(A))
+    z[model.n_states] = 1.0
+    for _ in range(150):
+        z, z_hat = A @ z, A @ z_hat
+        z_hat += K @ C @ (z - z_hat)
+    np.testing.assert_allclose(C @ z_hat, C @ z, atol=1e-3 * np.abs(C @ z).max())
+
+
 def naive(bank, estimate, drive, surplus, h):
     """One sample of the bank, one hypothesis after the other: members, weights and usual ones.
 

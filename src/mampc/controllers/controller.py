@@ -287,13 +287,14 @@ class Controller(ABC):
             plan.status, plan.lower_bound, plan.objective, plan.violations
         )  # fmt: skip
         changes, planned, applied = moves.reshape(self._shape), plan.inputs, state.inputs[-1:]
-        if planned is None:
+        if planned is not None:
+            planned = planned.reshape(self._shape)
+        else:
             if self._du_max is not None:
                 changes = np.minimum(np.maximum(changes, -self._du_max), self._du_max)
             # Sums in this order leave an input that does not move exactly where it was.
             planned = np.add.accumulate(changes)
             planned += applied
-        planned = planned.reshape(self._shape)
         kept = inputs.clipped(planned)
         same = kept.tobytes() == planned.tobytes()  # as nearly always
         if not same and (np.abs(kept - planned) > self._resolution + ROUNDED * np.abs(planned)).any():

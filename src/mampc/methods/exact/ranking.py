@@ -47,6 +47,7 @@ class Ranking:
         # A free move more never costs more: then only patterns that spend the whole budget are of interest.
         nested = admissible.nested
         starts = [0, *ends[:-1]] if nested else [0] * len(ends)
+        self._all_free = (0,) * admissible.n_inputs
         self._rows_within = [slice(start, end) for start, end in zip(starts, ends, strict=True)]
         self.charge = admissible.charges(self.patterns)
         n = condensed.n_moves
@@ -68,7 +69,7 @@ class Ranking:
         """Where the patterns stand among which the best one is, given the past."""
         rows = self._rows_within[min(past.left, len(self._rows_within) - 1)]
         # Frozen inputs may leave part of the budget unspent.
-        return slice(0, rows.stop) if any(past.frozen) else rows
+        return rows if past.frozen == self._all_free else slice(0, rows.stop)
 
     def bounds(
         self, free: Array, least: float, past: Allowance, later_data: LaterData | None = None
@@ -81,9 +82,8 @@ class Ranking:
             past: what the applied moves leave.
             later_data: what patterns cost beside their prices, for plans that count on them.
         """
-        x = free * self.condensed.lengths
-        rows = self.rows(past)
-        values = self.excess(free, rows)
+        rows, x = self.rows(past), free * self.condensed.lengths
+        values: Array = self.table[rows].dot(x.take(self._rows) * x.take(self._columns))
         values += least - self.rounding(x)
         if self.admissible.priced:
             values += self.charge[rows]
@@ -91,7 +91,7 @@ class Ranking:
             values += later_data.charges(self.patterns)[rows]
         if self.admissible.sized:
             values += self.lift(x[None], rows)[:, 0]
-        if any(past.frozen):
+        if past.frozen != self._all_free:
             values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
         return values
 

@@ -127,7 +127,9 @@ class ExactSearch:
             optimum = ranking.optimum(at, sample)
             margins = optimum.margins
             if not len(margins) or margins[margins.argmin()] > INSIDE:
-                objective = optimum.cost + float(ranking.charge[at]) + sample.charge(ranking.patterns[at])
+                objective = optimum.cost + float(ranking.charge[at])
+                if sample.later_data is not None:
+                    objective += sample.charge(ranking.patterns[at])
                 if objective - bounds[best] <= TIE * objective:
                     return Plan(
                         optimum.moves, Status.OPTIMAL, 1, None, None, optimum.inputs, objective,
