@@ -3,7 +3,8 @@
     python benchmarks/levels.py      # the table of docs/methods.md; about a minute
 
 A first-order plant (10 samples) whose valve is on or off, reference 8 of 10, horizons of 10 and 15 samples, with and
-without times; and the paper's tank with valves on a grid of 0.5 %, with and without rules.
+without times; the paper's tank with valves on a grid of 0.5 %, with and without rules; and three inputs on grids of a
+hundredth and a twentieth of their range, horizons 30/8, with a price.
 """
 
 from __future__ import annotations
@@ -65,6 +66,24 @@ def cases() -> Iterator[tuple[str, dict[str, Any]]]:
             mampc.KalmanFilter.offset_free(problem.model),
         )
         yield f"tank, {name}", {"plant": tank, "regulator": regulator, "reference": reference, "noise": 0.1}
+    model = mampc.StateSpace.from_first_order(
+        gain=[[2.0, -0.7, 0.3], [0.5, 1.5, -0.4], [-0.3, 0.4, 1.2]],
+        time_constant=[[120, 200, 80], [90, 150, 60], [100, 70, 180]],
+        dead_time=[[20, 0, 10], [0, 30, 0], [10, 10, 0]], dt=10.0,
+    )  # fmt: skip
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=30, control_horizon=8, limits=mampc.Limits(u_min=-5.0, u_max=5.0)
+    )
+    reference = mampc.steps(STEPS, [0.0, 0.0, 0.0], [(5, [2.0, -1.0, 1.5]), (100, [0.0, 1.0, 0.5])])
+    for step in (0.1, 0.5):
+        regulator = mampc.Regulator(
+            mampc.MAMPC(problem, mampc.MoveRules(levels=step, price=0.3)),
+            mampc.KalmanFilter.offset_free(model),
+        )
+        yield (
+            f"3 inputs, grid of {step / 10:.0%}, price 0.3",
+            {"plant": model, "regulator": regulator, "reference": reference, "noise": 0.05},
+        )
 
 
 def main() -> None:

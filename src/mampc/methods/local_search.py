@@ -110,7 +110,7 @@ class LocalSearch:
                 pattern = next(patterns) if solved is None else patterns.send(solved)
                 if best.moves is not None and perf_counter() > deadline:
                     return
-                solved = solver.offer(sample, pattern, best, deadline)
+                solved = solver.offer(sample, pattern, best, deadline, first=True)
 
     def patterns(self, sample: Sample, f: Array, past: Allowance) -> Generator[BoolArray, OnPattern, int]:
         """Patterns, each from the last, whose multipliers price the limits in; is sent the best moves on each.

@@ -83,10 +83,26 @@ class LevelSearch:
         self.condensed, self.admissible, self.levels = condensed, admissible, levels
         self.on_levels = np.tile([values is not None for values in levels.values], admissible.control_horizon)
         self._factors: OrderedDict[bytes, Factor] = OrderedDict()
-        limited = len(condensed.bounds.above) + len(condensed.bounds.below) > 0 and bool(self.on_levels.all())
+        limited = len(condensed.bounds.above) + len(condensed.bounds.below) > 0
         self.outputs = LimitedOutputs(condensed) if limited else None
-        zoned = condensed.bounds.zones is not None and bool(self.on_levels.all())
-        self.zones = ZonedOutputs(condensed) if zoned else None
+        self.zones = None if condensed.bounds.zones is None else ZonedOutputs(condensed)
+
+    @property
+    def rounding_cost(self) -> float:
+        """What it costs on average to round a move to a level where later moves make up for it, in prices.
+
+        Infinite where some move has no price.
+        """
+        m, price = self.admissible.n_inputs, self.admissible.price
+        factor = self.factor(np.ones(self.condensed.n_moves, dtype=bool))
+        if not len(factor.moves) or not (price[factor.moves % m] > 0).all():
+            return np.inf
+        widths = np.array([
+            0.0 if values is None or len(values) < 2 else (values[-1] - values[0]) / (len(values) - 1)
+            for values in self.levels.values
+        ])  # fmt: skip
+        lost = np.square(np.diag(factor.L) * widths[factor.moves % m]) / 12
+        return float((lost / price[factor.moves % m]).mean())
 
     def past(self, inputs: Array) -> Past:
         """What the applied inputs, shape (h, m) with the latest last, mean for timings."""
@@ -119,6 +135,7 @@ class LevelSearch:
         *,
         priced: LeastSquares | None = None,
         completed: Completion | None = None,
+        paid: bool = False,
         cutoff: float = np.inf,
         deadline: float = np.inf,
         most: float = np.inf,
@@ -130,11 +147,13 @@ class LevelSearch:
             past: of `past`.
             priced: the problem with limits priced in, which bounds courses too.
             completed: where the pattern has moves of inputs without levels.
+            paid: whether courses that make fewer moves than the pattern has are left to patterns of their own, so that
+                all of them are paid.
             cutoff: courses that cost as much are of no interest.
             deadline: of `perf_counter`.
             most: nodes to visit.
         """
-        one = _OneSample(self, sample, self.factor(pattern), allowance, past, priced, completed, cutoff)
+        one = _OneSample(self, sample, self.factor(pattern), allowance, past, priced, completed, paid, cutoff)
         return one.run(deadline, most)
 
 
@@ -150,22 +169,28 @@ class _OneSample:
         past: Past,
         priced: LeastSquares | None,
         completed: Completion | None,
+        paid: bool,
         cutoff: float,
     ) -> None:
         condensed, admissible = of.condensed, of.admissible
         m = self._m = admissible.n_inputs
         self._of, self._rules, self._sample, self._factor = of, admissible, sample, factor
         self._allowance, self._past, self._condensed = allowance, past, condensed
-        self._outputs, self._zones, self._completed = of.outputs, of.zones, completed
-        self._room = None if of.outputs is None else of.outputs.room(sample)
+        # What moves without levels make of outputs is known with a course that is complete.
+        self._completed = completed
+        self._outputs, self._zones = (of.outputs, of.zones) if completed is None else (None, None)
+        self._room = None if self._outputs is None else self._outputs.room(sample)
         self._best: Array | None = None
         self._objective, self._rounding = cutoff, condensed.rounding(sample)
         self._next = NextMoves(condensed, admissible, of.levels, sample, allowance, past)
         # Moves of inputs without levels are given by the pattern, and paid.
         self._now = np.bincount(factor.free // m, minlength=admissible.control_horizon)
         self._used = int((self._now > 0).sum()) if admissible.simultaneous else len(factor.free)
-        self._charge = admissible.charge(np.isin(np.arange(condensed.n_moves), factor.free))
-        self._few = admissible.priced or admissible.rules.max_moves is not None
+        given = np.concatenate([factor.free, factor.moves]) if paid else factor.free
+        self._charge = admissible.charge(np.isin(np.arange(condensed.n_moves), given))
+        self._paid = paid
+        self._price: Array = np.zeros(m) if paid else admissible.price
+        self._few = (admissible.priced and not paid) or admissible.rules.max_moves is not None
         self._few &= not (admissible.simultaneous and self._used)
         squares = [sample.least_squares] + ([] if priced is None else [priced])
         self._t = np.array([factor.reached @ one.target for one in squares])
@@ -269,7 +294,7 @@ class _OneSample:
             children.last[moved, a] = j
             counted = 1 if not self._rules.simultaneous else (children.now[moved] == 0).astype(int)
             children.used[moved] += counted
-            children.charge[moved] += self._rules.price[a] * counted
+            children.charge[moved] += self._price[a] * counted
             children.now[moved] += 1
         last_of_sample = step + 1 == len(self._steps) or self._steps[step + 1][0] // self._m != j
         if self._outputs is not None and self._room is not None and last_of_sample:
@@ -292,7 +317,7 @@ class _OneSample:
         rules, L = self._rules, self._factor.L[p:, p:]
         rest = nodes.rest[:, :, p:]
         none = nodes.cost + np.square(rest).sum(axis=2)
-        prices = rules.price[self._factor.moves[p:] % self._m]
+        prices = self._price[self._factor.moves[p:] % self._m]
         one = more = np.full_like(none, np.inf)
         if len(prices) and rules.simultaneous:
             one = more = nodes.cost + prices[0]
@@ -321,5 +346,7 @@ class _OneSample:
                 if completed is None:
                     continue
                 moves, objective = completed
+            elif self._paid:
+                objective += self._rules.charge(moves != 0) - self._charge
             if objective < self._cutoff:
                 self._best, self._objective = moves, objective

@@ -111,6 +111,11 @@ class PatternSolver:
         """The moves of inputs without levels, shape (n_moves,), where others have some; else None."""
         return None if self._levels is None else ~self._levels.on_levels
 
+    @property
+    def rounding_cost(self) -> float:
+        """What it costs on average to round a move to a level, in prices; infinite where some move has none."""
+        return np.inf if self._levels is None else self._levels.rounding_cost
+
     def best_course(
         self,
         sample: Sample,
@@ -174,11 +179,13 @@ class PatternSolver:
         deadline: float = np.inf,
         *,
         within: tuple[Array, Array] | None = None,
+        paid: bool = False,
         most: float = np.inf,
     ) -> OnPattern:
         """The best moves that are zero off `pattern`, if their objective is below `cutoff`.
 
-        With least sizes, `within` are intervals of the pattern's moves that tell their signs.
+        With least sizes, `within` are intervals of the pattern's moves that tell their signs. With levels, `paid` says
+        that the pattern's price counts, though single moves may turn out to be none.
         A search over signs stops at the deadline, of `perf_counter`, or after `most` programs.
         """
         bounds = self._bounds(sample, pattern)
@@ -206,7 +213,7 @@ class PatternSolver:
             return OnPattern(None, bound, nearest.status, nearest.multipliers, 1)
         if self._levels is not None:
             return self._on_levels(
-                sample, pattern, optimum, bounds, nearest.multipliers, cutoff, deadline, most
+                sample, pattern, optimum, bounds, nearest.multipliers, paid, cutoff, deadline, most
             )
         sizes = self.admissible.min_size[pattern]
         if not sized or (nearest.moves is optimum and (np.abs(optimum) >= sizes).all()):
@@ -229,18 +236,19 @@ class PatternSolver:
         optimum: Array,
         bounds: tuple[Array, Array],
         multipliers: Array | None,
+        paid: bool,
         cutoff: float,
         deadline: float,
         most: float,
     ) -> OnPattern:
-        """The best moves on a pattern that lead from level to level; those that stay cost nothing."""
+        """The best moves on a pattern that lead from level to level; those that stay cost nothing unless `paid`."""
         assert self._levels is not None
         assert self._past is not None
         mixed = len(self._levels.factor(pattern).free) > 0
         found = self._levels.search(
             sample, pattern, self._all_free, self._past, priced=self.priced(sample, multipliers),
-            completed=self._completion(sample, pattern, optimum, bounds) if mixed else None, cutoff=cutoff,
-            deadline=deadline, most=NODES * most,
+            completed=self._completion(sample, pattern, optimum, bounds) if mixed else None, paid=paid,
+            cutoff=cutoff, deadline=deadline, most=NODES * most,
         )  # fmt: skip
         status = QPStatus.OPTIMAL if found.complete else QPStatus.TIME_LIMIT
         if found.moves is None and found.complete and cutoff == np.inf:
@@ -271,17 +279,23 @@ class PatternSolver:
         return OnPattern(moves, objective, QPStatus.OPTIMAL, multipliers, 1)
 
     def offer(
-        self, sample: Sample, pattern: BoolArray, best: Incumbent, deadline: float = np.inf
+        self,
+        sample: Sample,
+        pattern: BoolArray,
+        best: Incumbent,
+        deadline: float = np.inf,
+        *,
+        first: bool = False,
     ) -> OnPattern:
         """Offer the best moves on a pattern; where moves have a least size, also with single ones left out.
 
-        Each takes a share of the programs that are left, and one at least.
+        Each takes a share of the programs that are left, and one at least. With levels, `first` asks for a plan to
+        begin with: the best one found in about the time of a program.
         """
 
         def solved(pattern: BoolArray) -> OnPattern:
-            return self.solve(
-                sample, pattern, best.objective, deadline, most=max(SHARE * best.left_programs, 1)
-            )
+            most = 1.0 if first and self._levels is not None else max(SHARE * best.left_programs, 1)
+            return self.solve(sample, pattern, best.objective, deadline, most=most)
 
         before, proposed = best.objective, solved(pattern)
         best.offer(proposed)

@@ -84,6 +84,17 @@ class SampleProblem:
 
         `within`: intervals of its moves that tell their signs.
         """
-        solved = self._solver.solve(self.sample, pattern, self.best.objective, self.deadline, within=within)
+        solved = self._solver.solve(
+            self.sample,
+            pattern,
+            self.best.objective,
+            self.deadline,
+            within=within,
+            paid=self.admissible.priced,
+        )
         self.best.offer(solved)
         return self.relaxation.of_bounds(solved.multipliers)
+
+    def offer_first(self, pattern: BoolArray) -> None:
+        """Offer a plan on a pattern that will be visited again, to begin with."""
+        self._solver.offer(self.sample, pattern, self.best, self.deadline, first=True)

@@ -35,6 +35,7 @@ from mampc.program.qp import QPStatus
 from mampc.program.sample import Sample
 
 MOST_BESIDE_LEVELS = 1000  # patterns of inputs without levels that are tried one by one
+FINE = 0.1  # of a move's price: what it costs at most, on average, to round a move to a level of a fine grid
 TOGETHER = 3  # patterns of the table whose limits are priced together
 
 
@@ -98,9 +99,12 @@ class ExactSearch:
         return self._ranking is not None
 
     def _patterns_beside_levels(self) -> BoolArray | None:
-        """The patterns, shape (K, n_moves), of inputs without levels where others have some, if they are few."""
+        """The patterns, shape (K, n_moves), of inputs without levels where others have some, if they are few.
+
+        None too where levels are fine beside prices: then patterns decide, and hardly what levels leave of their plans.
+        """
         free = self._solver.free
-        if free is None:
+        if free is None or (self.condensed.bounds.zones is None and self._solver.rounding_cost < FINE):
             return None
         if self.admissible.nested and self.admissible.rules.max_moves is None:
             return (self.admissible.candidates & free)[None]
@@ -184,7 +188,8 @@ class ExactSearch:
                 return self._plan(sample, best, best.objective)
             if perf_counter() > deadline:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
-            solved = solver.solve(sample, ranking.patterns[open_.rows[at]], best.objective, deadline)
+            pattern = ranking.patterns[open_.rows[at]]
+            solved = solver.solve(sample, pattern, best.objective, deadline, paid=self.admissible.priced)
             best.offer(solved, bound)
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)

@@ -118,7 +118,7 @@ class PatternTree:
             terms.drop_latest()
         pattern = problem.moving(found.moves)
         if self._admissible.allows(pattern, problem.allowance):
-            problem.offer(pattern)
+            problem.offer_first(pattern)
         return close
 
 

@@ -1,0 +1,100 @@
+"""Inputs on levels that are fine beside the price of a move are searched by patterns, others by courses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mampc
+from builders import random_model
+from mampc import Status
+from mampc.methods.exact import ranking, search
+from referees import objective_of
+from seeds import seeds
+from test_levels import instance, random_rules
+
+
+def case(seed):
+    """Levels of all kinds, a free input among them, every rule and a price; outputs with limits in turn."""
+    rng = np.random.default_rng(1000 + seed)
+    m = int(rng.integers(1, 4))
+    n_c = int(rng.integers(2, 5 if m < 3 else 3))
+    own, problem, levels, x, past, reference = instance(
+        seed, m, n_c, limited_outputs=seed % 2 == 0, few=rng.random() < 0.7
+    )
+    rules = replace(random_rules(own, levels, m), price=float(10 ** rng.uniform(-2, 0.5)))
+    entries = list(rules.levels)
+    if rng.random() < 0.25:
+        times = rng.integers(0, 3, 2).astype(float)
+        entries[0] = mampc.OnOff(off=-3.0, on=3.0, min_on=times[0], min_off=times[1])
+        past[:, 0] = rng.choice([-3.0, 3.0])
+    if m > 1 and seed % 4 < 2:
+        entries[-1], past[:, -1] = None, rng.uniform(-3, 3)
+        rules = replace(rules, min_size=0.0)
+    return problem, replace(rules, levels=entries), x, past, reference
+
+
+def decided(problem, rules, x, past, reference):
+    controller = mampc.MAMPC(problem, rules, method=mampc.Exact(time_limit=None))
+    return controller.step(controller.initial_state(past), x, reference)
+
+
+@pytest.mark.parametrize("seed", seeds(120, quick=16))
+def test_patterns_and_courses_have_the_same_optimum(seed, monkeypatch):
+    found = []
+    for fine, largest in ((0.0, None), (np.inf, ranking.LARGEST_TABLE), (np.inf, 0)):
+        monkeypatch.setattr(search, "FINE", fine)
+        if largest is not None:
+            monkeypatch.setattr(ranking, "LARGEST_TABLE", largest)
+        found.append(decided(*case(seed)))
+    assert {decision.status for decision in found} == {Status.OPTIMAL}
+    for decision in found[1:]:
+        assert decision.objective == pytest.approx(found[0].objective, rel=1e-9)
+    problem, rules, x, past, reference = case(seed)
+    for decision in found:
+        cost = objective_of(problem, rules, x, past, reference, decision.plan)
+        assert decision.objective == pytest.approx(cost, rel=1e-7)
+
+
+def three_inputs(levels, size=1.0):
+    """Three inputs in a unit that is `size` of another, far from their references."""
+    model = mampc.StateSpace.from_first_order(
+        gain=np.array([[2.0, -0.7, 0.3], [0.5, 1.5, -0.4], [-0.3, 0.4, 1.2]]) / size,
+        time_constant=[[120, 200, 80], [90, 150, 60], [100, 70, 180]], dt=10.0,
+    )  # fmt: skip
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=30, control_horizon=8, move_weight=0.01 / size**2,
+        limits=mampc.Limits(u_min=-5.0 * size, u_max=5.0 * size),
+    )  # fmt: skip
+    controller = mampc.MAMPC(
+        problem, mampc.MoveRules(levels=levels * size, price=0.3), method=mampc.Exact(time_limit=None)
+    )
+    return controller, np.zeros(model.n_states), [2.0, -1.0, 1.5]
+
+
+def test_fine_levels_of_three_inputs_are_proven_in_few_programs():
+    controller, x, reference = three_inputs(0.05)
+    decision = controller.step(controller.initial_state(), x, reference)
+    assert decision.status is Status.OPTIMAL
+    assert decision.iterations < 50
+    assert np.allclose(decision.plan / 0.05, np.round(decision.plan / 0.05), atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-5, 1e4])
+def test_units_of_inputs_decide_nothing(size):
+    plans = []
+    for unit in (1.0, size):
+        controller, x, reference = three_inputs(0.1, unit)
+        plans.append(controller.step(controller.initial_state(), x, reference).plan / unit)
+    np.testing.assert_allclose(*plans, atol=1e-9)
+
+
+def test_coarse_levels_are_searched_by_courses():
+    model = random_model(2, n=3, m=2, l=2)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=8, control_horizon=3,
+        limits=mampc.Limits(u_min=model.u_op - 3, u_max=model.u_op + 3),
+    )  # fmt: skip
+    for levels, price, by_table in ((mampc.OnOff(), 0.1, False), (1e-4, 0.1, True), (1e-4, 0.0, False)):
+        controller = mampc.MAMPC(problem, mampc.MoveRules(levels=levels, price=price))
+        assert controller._search.has_table is by_table
