@@ -116,3 +116,23 @@ def test_a_number_before_good_keeps_it_good(tmp_path, good):
 def test_a_dash_for_a_minus(tmp_path):
     [record] = read(tmp_path, text(rows(y=[f"–{value}" for value in Y]))).records
     np.testing.assert_array_equal(record.y[:, 0], -Y)
+
+
+def test_of_two_rows_of_names_the_one_above_the_numbers_is_the_header(tmp_path):
+    path = write(tmp_path, SYSTEMS["names above a block of descriptions"])
+    seen = inspect_export(path)
+    assert (seen.time, [column.name for column in seen.columns]) == ("Timestamp", ["u", "y"])
+
+
+def test_times_without_a_date_are_told_without_one(tmp_path):
+    times = stamps(start="2024-04-13 23:55:00", form="%H:%M:%S")
+    seen = inspect_export(write(tmp_path, text(rows(times))))
+    assert (seen.start, seen.end) == ("23:55:00", "00:06:00 on day 2")
+    assert read(tmp_path, text(rows(times))).starts == ("23:55:00",)
+
+
+def test_columns_with_few_values_are_told_before_any_is_named(tmp_path):
+    lines = [[time, u if k in (0, 6) else "", y] for k, (time, u, y) in enumerate(rows())]
+    seen = inspect_export(write(tmp_path, text(lines)))
+    assert seen.columns[0].verdict == "has few values: stored on change?"
+    assert any("--on-change" in note for note in seen.notes)

@@ -62,7 +62,7 @@ def model_words(model: StateSpace) -> list[str]:
     settles = "" if found.unstable else f"; settles within {time_in_words(found.settling_time)}"
     sentences = [f"sampled every {time_in_words(model.dt)}{settles}"]
     if found.integrators:
-        sentences.append(f"{found.integrators} of its poles integrate: they are at one")
+        sentences.append(f"poles that integrate, at exactly one: {found.integrators}")
     if found.unstable:
         sentences.append(f"unstable: {found.unstable} of its poles are outside the unit circle")
     if found.condition is not None and found.condition > 1:

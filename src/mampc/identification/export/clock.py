@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ NAMES = re.compile(
     r"(time|t|timestamp|date|datetime|elapsed|seconds|zeit|zeitstempel|temps|tiempo|tempo|tijd|tid)([\W_].*)?"
 )
 STAMP = re.compile(r"[^\d]{0,5}\d+[-/.:, T]+\w+[-/.:, T]+\d+.*|\d{8}[T ]\d{4,6}.*")
+UNDATED = datetime(1900, 1, 1)  # the day of times without a date
 EXACT = ("time", "timestamp")
 
 
@@ -60,6 +61,9 @@ class Clock:
         if self.origin is None:
             return f"{second:.10g} s"
         moment = self.origin + timedelta(seconds=round(second, 6))
+        if self.origin.year <= UNDATED.year:
+            day = (moment - UNDATED).days
+            return f"{moment.time().isoformat()}{f' on day {day + 1}' if day else ''}"
         return f"{moment.isoformat(sep=' ')}{self.zone}"
 
 

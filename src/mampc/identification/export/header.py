@@ -148,13 +148,22 @@ def likelihood(reading: tuple[str | None, Any, Sequence[Row]]) -> tuple[bool, bo
 
 
 def likeliest_header(head: Sequence[Row]) -> int:
-    """The first row of words that is as wide as most rows, else the first row."""
+    """The first row of words that is as wide as most rows, or one that says the same again; else the first row."""
     widths = [len(without_empty_end(row)) for _, row in head]
     usual = max(set(widths), key=lambda width: (widths.count(width) * width, width))
+    found = None
     for i, (_, row) in enumerate(head):
-        if widths[i] >= usual > 1 and not any(is_number_like(cell) for cell in row):
-            return i
-    return 0
+        if any(is_number_like(cell) for cell in row):
+            if found is not None and widths[i] >= usual:
+                break
+        elif widths[i] >= usual > 1 and (found is None or _same_names(head[found][1], row)):
+            found = i
+    return 0 if found is None else found
+
+
+def _same_names(one: Sequence[str], other: Sequence[str]) -> bool:
+    """Whether all cells but the first are the same."""
+    return len(set(one[1:])) > 1 and list(one[1:]) == list(other[1:])
 
 
 def _evenness(head: Sequence[Row]) -> int:

@@ -16,7 +16,7 @@ from mampc.identification.export.findings import Findings
 from mampc.identification.export.grid import make_grid, pieces
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Column, read_numbers, says_numbers
-from mampc.identification.export.on_change import hint_of_changes, hold_last, sampled
+from mampc.identification.export.on_change import RARE, hint_of_changes, hold_last, sampled
 from mampc.identification.export.quality import drop_bad_quality, is_quality
 from mampc.identification.export.reading import ReadingOptions, listed, readings
 from mampc.identification.export.sheet import Sheet
@@ -126,9 +126,8 @@ def inspect_export(
         if column.marks:
             findings.note(str(column))
     on_change = listed(options.get("on_change", ()))
-    if wanted:
-        hint_of_changes(values, list(positions), on_change, findings)
-    if wanted or on_change:
+    hint_of_changes(values, list(positions), on_change, findings)
+    if on_change:
         hold_last(sheet, positions, on_change, clock, values, findings)
     held = np.array([name in on_change for name in positions])
     clock, values, numbers = sampled(clock, values, sheet.numbers, held, dt, findings)
@@ -181,7 +180,9 @@ def _summary(column: Column, unit: str, order: Any) -> ColumnSummary:
     changes = np.flatnonzero(np.diff(known))
     moves = len(changes)
     held = float(np.median(np.diff(changes))) if moves > 1 else float(len(known))
-    if not moves:
+    if len(known) < RARE * len(values):
+        verdict = "has few values: stored on change?"
+    elif not moves:
         verdict = "never moves"
     elif moves > HELD * (len(known) - 1):
         verdict = "moves at nearly every sample: measured, or under control"
