@@ -32,13 +32,17 @@ def print_list(console: Console, title: str, sentences: Sequence[str]) -> None:
 
 @contextmanager
 def progress() -> Iterator[Any]:
-    """A function that shows the current stage: a spinner on a terminal, a line each elsewhere."""
+    """A function that shows the current stage: with the time gone on a terminal, a line each elsewhere."""
     console = Console(stderr=True, highlight=False, markup=False)
     if not console.is_terminal:
         yield lambda stage: None if stage.startswith(("figure", "report.html")) else complain(f"{stage} ...")
         return
-    with console.status("") as status:
-        yield lambda stage: status.update(f"{stage} ...")
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as shown:
+        task = shown.add_task("")
+        yield lambda stage: shown.update(task, description=f"{stage} ...")
 
 
 @contextmanager
