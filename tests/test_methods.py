@@ -1,6 +1,7 @@
 """Every method keeps limits and rules, costs what it says, and is never better than the proven optimum."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,6 +135,24 @@ def test_an_easy_optimum_is_found(name):
     assert found.objective == pytest.approx(best.objective, rel=1e-9)
     assert (found.moves == best.moves).all()
     assert found.moves.sum() == 1
+
+
+def test_greedy_spreads_what_no_single_move_can_do():
+    """Where moves are bounded, the work of one takes several, which pay only together with the first."""
+    found, left_open = 0, []
+    for seed in range(examples(100, quick=20)):
+        problem, past, x, reference = sample(seed, narrow=False)
+        largest = np.abs(decide(mampc.MPC(problem), past[-1], x, reference).changes).max(axis=0)
+        problem = replace(problem, limits=replace(problem.limits, du_max=0.3 * largest))
+        rules = MoveRules(price=0.1)
+        best, greedy = (
+            decide(controller_of(problem, rules, name), past, x, reference).objective
+            for name in ("exact", "greedy")
+        )
+        left_open.append(greedy / best - 1)
+        found += left_open[-1] < 1e-7
+    assert found >= 0.75 * len(left_open)
+    assert np.mean(left_open) < 0.003
 
 
 @every_heuristic

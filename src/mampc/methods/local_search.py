@@ -7,6 +7,10 @@ Adding j gains r_j^2 / (2 q_j), dropping p loses d_p^2 / (2 W_pp), and after dro
     r'_j = r_j - B_pj d_p / W_pp,    q'_j = q_j + B_pj^2 / W_pp
 
 so that all exchanges of one move for another are priced at once.
+
+Multipliers say nothing of a limit that a pattern has not run into yet: where moves are bounded, one that does the work
+of three looks as good. So a plan that runs into limits is exchanged move by move, with those at a bound held there, and
+each exchange is made sure of by its program.
 """
 
 from __future__ import annotations
@@ -29,6 +33,8 @@ LEAST_CURVATURE = 1e-14  # of a move's own: what others leave of it cannot be to
 MOST_EXCHANGES = 200
 TAKEN = 1e200  # curvature of a move that is on the pattern already: nothing to gain
 ROUNDS = 3  # of local search, with limits priced in by the multipliers of the last
+TRIALS = 3  # exchanges that are tried before a plan with limits counts as the best of its neighbours
+MOST_TRIALS = 60
 
 
 class LocalSearch:
@@ -119,22 +125,102 @@ class LocalSearch:
         Returns how many there were.
         """
         least_gain = LEAST_GAIN * sample.constant
-        pattern = self.forward(f, past)
+        pattern, best = self.forward(f, past), None
         for number in range(ROUNDS):
             last, pattern = pattern, self.exchange(f, past, pattern, least_gain)
             if number and (pattern == last).all():
-                return number
+                break
             solved = yield pattern
+            if solved.moves is not None:
+                best = pattern, solved
             if solved.multipliers is None or not solved.multipliers.any():
-                return number + 1
+                break
             f, _ = self.condensed.relaxed_limits(sample, solved.multipliers)
-        return ROUNDS
+        else:
+            number = ROUNDS
+        if best is None or best[1].multipliers is None or not best[1].multipliers.any():
+            return number + 1
+        return number + 1 + (yield from self._one_by_one(sample, past, *best, least_gain))
 
-    def _gain(self, r: Array, q: Array) -> Array:
-        """What a move gains, given its gradient and curvature, when it has at least its least size."""
+    def _one_by_one(
+        self, sample: Sample, past: Allowance, pattern: BoolArray, solved: OnPattern, least_gain: float
+    ) -> Generator[BoolArray, OnPattern, int]:
+        """Patterns from one whose plan runs into limits to ever better neighbours; returns how many were tried."""
+        tried = 0
+        while True:
+            for better in self._neighbours(sample, past, pattern, solved, least_gain):
+                if tried == MOST_TRIALS:
+                    return tried
+                tried += 1
+                answer = yield better
+                if answer.moves is not None:  # it is better than all before
+                    pattern, solved = better, answer
+                    break
+            else:
+                return tried
+
+    def _neighbours(
+        self, sample: Sample, past: Allowance, pattern: BoolArray, solved: OnPattern, least_gain: float
+    ) -> list[BoolArray]:
+        """The neighbours of a pattern that seem the best, moves at their bounds held there."""
+        assert solved.moves is not None
+        d, f, H, v = solved.moves, sample.f_moves, self._H, self.condensed.n_violations
+        r = g = f + H @ d
+        low, high = np.full(len(d), -np.inf), np.full(len(d), np.inf)
+        bounded = self.condensed.bounds.n_simple - v
+        low[:bounded], high[:bounded] = sample.lower[v : v + bounded], sample.upper[v : v + bounded]
+        at_bound = np.zeros(len(d), dtype=bool)
+        if solved.multipliers is not None:
+            r = self.condensed.relaxed_limits(sample, solved.multipliers)[0] + H @ d
+            at_bound[:bounded] = solved.multipliers[v : v + bounded] != 0
+        exchanges = PatternNeighbours(self.admissible, past, pattern)
+        held = exchanges.held
+        free = held[~at_bound[held]]
+        try:
+            W = np.linalg.inv(H[np.ix_(free, free)])
+        except np.linalg.LinAlgError:  # moves that rounding cannot tell apart
+            return []
+        if not (np.diag(W) > 0).all():
+            return []
+        B = W @ H[free]
+        left = H - H[:, free] @ B  # curvature once free moves adapt, all pairs
+        q, w = np.diag(left).copy(), np.ones(len(d))
+        q[free], w[free] = 1.0, np.diag(W)
+        loss = np.where(at_bound, 0.5 * q * d * d - g * d, 0.5 * d * d / w)[held]
+        step = np.where(at_bound, d, d / w)[held]
+        toward = left[held]
+        toward[~at_bound[held]] = B
+        more = np.where(at_bound[held, None], 0.0, toward**2 / w[held, None])
+
+        added = self._gain(r, q, np.where(r < 0, high, -low)) - exchanges.added_price()
+        added = np.where(exchanges.additions(), added, 0.0)
+        dropped = exchanges.dropped_price() - loss
+        r_left = r - toward * step[:, None]
+        swapped = self._gain(r_left, q + more, np.where(r_left < 0, high, -low)) - loss[:, None]
+        swapped = np.where(exchanges.swaps(), swapped - exchanges.swapped_price(), 0.0)
+        gains = np.concatenate([added, dropped, swapped.ravel()])
+        found = []
+        for choice in np.argsort(-gains, kind="stable")[:TRIALS].tolist():
+            if not gains[choice] > least_gain:
+                break
+            better, n = pattern.copy(), len(d)
+            if choice < n:
+                better[choice] = True
+            elif choice < n + len(held):
+                better[held[choice - n]] = False
+            else:
+                row, column = divmod(choice - n - len(held), n)
+                better[held[row]], better[column] = False, True
+            found.append(better)
+        return found
+
+    def _gain(self, r: Array, q: Array, room: Array | None = None) -> Array:
+        """What a move gains, given its gradient and curvature, of at least its least size and at most its room."""
         q = np.maximum(q, LEAST_CURVATURE * self._diagonal)
-        if not self.admissible.sized:
+        if not self.admissible.sized and room is None:
             gain: Array = 0.5 * r * r / q
             return gain
         size = np.maximum(np.abs(r) / q, self.admissible.min_size)
+        if room is not None:
+            size = np.minimum(size, room)
         return np.asarray(np.abs(r) * size - 0.5 * q * size * size)
