@@ -13,7 +13,6 @@ from mampc.base.words import Fault, LoadKind, Remark, Status
 from mampc.controllers import MAMPC, MPC, ControllerBank, ControllerState, Decision
 from mampc.controllers.offset import largest_offset
 from mampc.controllers.targets import Targets, targets
-from mampc.loop import loads
 from mampc.loop.hypotheses import Hypothesis
 from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.load_bank import LoadBank
@@ -61,6 +60,7 @@ if TYPE_CHECKING:
         read_export,
         validate,
     )
+    from mampc.loop import loads
     from mampc.loop.batch import Batch, simulate_batch
     from mampc.loop.learnt_gains import LearntGains, learn_gains
     from mampc.loop.recorder import Recorder
@@ -79,6 +79,7 @@ _LATER = {
     "loop.replay": ("Difference", "Recording", "replay"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _LATER.items() for name in names}
+_MODULES = {"identification": "identification", "loads": "loop.loads", "rivals": "rivals"}
 
 __version__ = "0.1.0"
 
@@ -158,8 +159,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("identification", "rivals"):
-        return import_module(f"mampc.{name}")
+    if name in _MODULES:
+        return import_module(f"mampc.{_MODULES[name]}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'mampc' has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(f"mampc.{_MODULE_OF[name]}"), name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from mampc.base.progress import watched
 from mampc.controllers.bank import ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.loop.interventions import Interventions
-from mampc.loop.loads import Load, drawn
 from mampc.loop.motion import Faults, motion_of
 from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
@@ -25,6 +24,9 @@ from mampc.plants import Plant
 from mampc.program.problem import Limits
 from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
+
+if TYPE_CHECKING:
+    from mampc.loop.loads import Load
 
 LONGEST_RUN = 10_000_000  # samples
 
@@ -174,6 +176,8 @@ class Acting:
 
     def drawn(self, seed: int) -> Course:
         """With noise and loads of a seed."""
+        from mampc.loop.loads import drawn
+
         at, seed = dict(self.at), as_whole("seed", seed, 0)
         T = len(at["output"])
         signals = {place: rows.shape[1] for place, rows in at.items()}
