@@ -96,9 +96,9 @@ def test_kinds_of_load_count_alike_and_a_better_one_makes_up_for_no_other():
 def test_a_kind_of_load_with_more_error_than_allowed_is_named():
     goal, kinds = promise.Goal(0.25, None, hours=1.0), [(mampc.loads.RandomWalk(size=1.0),), ()]
     text = str(promise.Expected.of(*in_turn(1.4, 0.9), goal, kinds))
-    assert "Under random walk alone the error is larger than the 1.25 times allowed" in text
+    assert "More than the 1.25 allowed under random walk: where your plant has no other loads" in text
     assert "no load 0.90" in text
-    assert "alone" not in str(promise.Expected.of(*in_turn(1.2, 1.1), goal, kinds))
+    assert "More than" not in str(promise.Expected.of(*in_turn(1.2, 1.1), goal, kinds))
 
 
 @pytest.mark.parametrize("falls", [False, True])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mampc.base.checks import Array, as_number
-from mampc.base.errors import MampcError, listed
+from mampc.base.errors import MampcError
 from mampc.compare.fronts import FEWEST, Estimate, Point
 from mampc.loop.loads import Load
 
@@ -170,8 +170,8 @@ class Expected:
             above = [name for name, ratio in kinds if self.allowed and ratio.value > self.allowed]
             if above:
                 text += (
-                    f". Under {listed(above)} alone the error is larger than the {self.allowed:g} times allowed: "
-                    "where your plant has no other loads, tell tune which it has"
+                    f". More than the {self.allowed:g} allowed under {' and '.join(above)}: where your plant has no "
+                    "other loads, tell tune which it has"
                 )
         return text
 
