@@ -45,8 +45,7 @@ def taken_for_granted(page):
 def test_the_python_of_a_page_runs(page, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(mampc, "tune", partial(mampc.tune, jobs=1))
-    for name in ("SEARCHED", "REFINED", "CONFIRMED", "SEARCH_PRICES", "REFINE_PRICES"):
-        monkeypatch.setattr(tuning, name, 3)
+    monkeypatch.setattr(tuning, "ROUNDS", tuning.ROUNDS._replace(**dict.fromkeys(tuning.ROUNDS._fields, 3)))
     monkeypatch.setattr(candidates, "MOVE_WEIGHTS", (0.1,))
     monkeypatch.setattr(candidates, "TAILS", (0.0,))
     monkeypatch.setattr(scenarios, "LENGTHS", (60, 60))
