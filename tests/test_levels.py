@@ -9,7 +9,7 @@ import pytest
 import mampc
 from builders import random_model
 from mampc import Remark, Status
-from referees import keeps_rules, keeps_timings, moved, objective_of, scip_on_levels
+from referees import best_on, keeps_rules, keeps_timings, moved, objective_of, program_of, scip_on_levels
 from seeds import examples, seeds
 
 METHODS = {name: {"polish": True} if name == "alternating" else {} for name in mampc.METHODS}
@@ -116,6 +116,33 @@ def test_no_course_on_the_levels_is_better_where_outputs_have_zones(seed):
     assert decision.status is Status.OPTIMAL
     assert decision.objective == pytest.approx(
         brute_force(problem, rules, levels, x, past, reference, n_c), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("zoned", [False, True])
+@pytest.mark.parametrize("seed", seeds(20, quick=6))
+def test_no_course_is_better_where_an_input_beside_levels_may_stay(seed, zoned):
+    """Without a move of that input no program is solved: limits and zones of outputs count all the same."""
+    rng, problem, levels, x, past, reference = instance(seed, 2, 2, limited_outputs=True)
+    if zoned:
+        problem = replace(problem, zone_below=0.4, zone_above=0.7)
+    rules = mampc.MoveRules(price=float(rng.choice([0.05, 1.0])), levels=[levels[0], None])
+    controller, program = mampc.MAMPC(problem, rules), program_of(problem, x, past[-1], reference)
+    decision = controller.step(controller.initial_state(past), x, reference)
+    best, n_violations = np.inf, len(program.f) - 4
+    for course, beside in product(product(levels[0], repeat=2), product([False, True], repeat=2)):
+        of_levels = np.diff([past[-1, 0], *course])
+        pattern = np.array([of_levels[0] != 0, beside[0], of_levels[1] != 0, beside[1]])
+        exactly = (
+            np.array([of_levels[0], -np.inf, of_levels[1], -np.inf]),
+            np.array([of_levels[0], np.inf, of_levels[1], np.inf]),
+        )
+        cost = best_on(program, pattern, n_violations, *exactly) + rules.price * pattern.sum()
+        best = min(best, cost)
+    assert decision.status is Status.OPTIMAL
+    assert decision.objective == pytest.approx(best, rel=1e-6)
+    assert decision.objective == pytest.approx(
+        objective_of(problem, rules, x, past, reference, decision.plan), rel=1e-7
     )
 
 
