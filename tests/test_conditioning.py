@@ -10,9 +10,11 @@ from conditioned import MPMATH, Referee, case_of
 from mampc import Status
 from mampc.base.words import Remark
 from mampc.methods.exact import ranking
+from mampc.program import refinement
 from mampc.program.condensing import CondensedQP
-from mampc.program.least_distance import LeastDistance, Nearest
-from mampc.program.qp import QPStatus
+from mampc.program.daqp import DaqpSolver
+from mampc.program.least_distance import LeastDistance, Nearest, ViolationCost
+from mampc.program.qp import QPSolution, QPStatus
 from mampc.program.refinement import refined
 from referees import charge
 from seeds import seeds
@@ -211,3 +213,32 @@ def test_programs_without_an_answer_leave_a_gap_and_a_remark(seed, largest, monk
         assert Remark.ROUNDING in decision.remarks
         assert decision.gap > 0
         assert decision.lower_bound > 0
+
+
+@pytest.mark.parametrize("shortest", [True, False])
+@pytest.mark.parametrize("k", [0, 3])
+def test_programs_far_from_zones_are_made_exact_in_few_rounds(k, shortest, monkeypatch):
+    """Where the solver gives up, every value is outside its zone: such bounds are guessed at once."""
+    rng, values, rounds = np.random.default_rng(k), 60, []
+    rows = rng.standard_normal((values + k, k))
+    rows[:k] = np.eye(k)
+    violations = np.vstack([np.zeros((k, values)), -np.eye(values)])
+    cost = ViolationCost(np.zeros(values), rng.uniform(0.5, 2.0, values))
+    program = LeastDistance(np.triu(rng.uniform(1.0, 2.0, (k, k))), rows, violations, cost, n_simple=k)
+    zone = np.sort(rng.choice([-1.0, 1.0], values) + rng.uniform(100.0, 101.0, (2, values)), axis=0)
+    lower, upper = (
+        np.concatenate([np.full(values, sign * np.inf), np.full(k, sign), end])
+        for sign, end in ((-1.0, zone[0]), (1.0, zone[1]))
+    )
+    optimum = rng.uniform(-1.0, 1.0, k)
+    expected = program.solve(optimum, lower, upper)
+    failed, at = QPSolution(None, None, QPStatus.FAILED, 1), refinement._at
+    solve = DaqpSolver.solve
+    monkeypatch.setattr(DaqpSolver, "solve_anew", lambda *data: failed)
+    monkeypatch.setattr(DaqpSolver, "solve", solve if shortest else lambda *data: failed)
+    monkeypatch.setattr(refinement, "_at", lambda *data: rounds.append(0) or at(*data))
+    found = program.solve(optimum, lower, upper)
+    assert expected.status is found.status is QPStatus.OPTIMAL
+    assert found.excess == pytest.approx(expected.excess, rel=1e-9)
+    assert np.allclose(found.moves, expected.moves, atol=1e-6)
+    assert len(rounds) <= 10

@@ -186,14 +186,20 @@ class LeastDistance:
         return DaqpSolver(QuadraticProgram(np.eye(v + k), A, v))
 
     def _tried_again(self, optimum: Array, lower: Array, upper: Array, failed: QPSolution) -> Nearest:
-        """What a solver failed at, from no active bounds on; INFEASIBLE only if there are no moves within bounds.
+        """What a solver failed at, made exact from a guess; INFEASIBLE only if there are no moves within bounds.
 
-        Where bounds leave a move one value, rounding alone makes a tight tolerance fail.
+        Where bounds leave a move one value, rounding alone makes a tight tolerance fail. Far from zones as many bounds
+        are active as values count, and each not guessed takes a round: the guess is those of the shortest moves,
+        or those that no moves at all break.
         """
         self._in_moves.start()
-        if self._in_moves.solve(np.zeros(len(self._f)), lower, upper).status is QPStatus.INFEASIBLE:
+        shortest = self._in_moves.solve(np.zeros(len(self._f)), lower, upper)
+        if shortest.status is QPStatus.INFEASIBLE:
             return Nearest(None, np.inf, None, QPStatus.INFEASIBLE, failed.iterations)
-        return self._refined(optimum, lower, upper, np.zeros(len(lower)), failed.iterations)
+        guess = shortest.multipliers
+        if guess is None:
+            guess = np.where(upper < 0, 1.0, np.where(lower > 0, -1.0, 0.0))
+        return self._refined(optimum, lower, upper, guess, failed.iterations)
 
     def _refined(
         self, optimum: Array, lower: Array, upper: Array, multipliers: Array, iterations: int
