@@ -224,6 +224,7 @@ def test_importing_mampc_leaves_out_heavy_modules_and_what_no_loop_needs():
 
 
 def test_every_public_name_is_there_and_no_other():
-    assert [name for name in mampc.__all__ if not hasattr(mampc, name)] == []
-    assert set(mampc.__all__) <= set(dir(mampc))
-    assert not hasattr(mampc, "MCP")
+    for module in (mampc, mampc.plants):
+        assert [name for name in module.__all__ if not hasattr(module, name)] == []
+        assert set(module.__all__) <= set(dir(module))
+        assert not hasattr(module, "MCP")

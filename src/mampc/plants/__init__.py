@@ -35,3 +35,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'mampc.plants' has no attribute {name!r}")
     return getattr(import_module(f"mampc.plants.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
