@@ -11,8 +11,8 @@ from builders import identified_tank, random_model, tank_problem
 from load_bank_models import MODELS, bank_of
 from mampc import LoadBank, LoadKind
 from mampc.loop.disturbances import state_sizes
+from mampc.loop.doubt import LATE
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
-from mampc.loop.load_bank import DOUBTED, FORGIVEN, LATE
 from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.riccati import predicted_covariance, seen_covariance
 
@@ -108,12 +108,7 @@ def naive(bank, estimate, drive, surplus, h):
         e = surplus - member.C @ z
         S = member.C @ member.covariance @ member.C.T + member.noise
         moved = sum(h[i] ** 2 * np.linalg.inv(S)[i, i] for i in range(len(e)))
-        trust = max(
-            1 / (1 + moved / len(e) / min(variance, 1.0)),
-            1 - FORGIVEN * np.sqrt(moved / (e @ np.linalg.solve(S, e))),
-            1 / DOUBTED,
-        )
-        doubted = 1 / trust
+        doubted = 1 + moved / len(e) / min(variance, 1.0)
         members.append(z + member.covariance @ member.C.T @ np.linalg.solve(S, e) / doubted)
         surprise.append(e @ np.linalg.solve(S, e) / doubted)
         likelihood.append(
@@ -133,6 +128,8 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
     estimate, v = bank.initial(model.u_op), model.v_op
     u, x, h, m = model.u_op, np.zeros(model.n_states), np.zeros(model.n_outputs), model.n_inputs
     kept, waits = np.exp(-1 / LATE), np.abs(model.poles()).max() < 1 + 1e-6
+    plain_filter = mampc.KalmanFilter.offset_free(model, measurement_noise=bank.noise)
+    plain = plain_filter.initial(model.u_op)
     for _ in range(25):
         last_u, last_v = u, v
         u = model.u_op + 0.1 * rng.standard_normal(model.n_inputs)
@@ -144,6 +141,7 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
             x = kept * model.A @ x + model.B[:, :m] @ (u - last_u)
             h = kept * (h + model.C @ x + model.D[:, :m] @ (u - last_u))
         members, weights, usual, scale = naive(bank, estimate, drive, surplus, h)
+        limit = min(estimate.scale[0], 1.0)
         predicted = bank.predict(estimate, u, last_v)
         innovation = bank.innovation(predicted, u, y, v)
         updated = bank.update(estimate, u, y, last_v, v)
@@ -155,6 +153,23 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
             np.testing.assert_allclose(one.scale, scale, rtol=1e-6)
             np.testing.assert_allclose(one.members, members, rtol=1e-6, atol=1e-6 * np.abs(members).max())
         estimate = updated.estimate
+        plain = plain_filter.update(plain, u, y, last_v, v).estimate
+        np.testing.assert_allclose(
+            estimate.x, trusted(bank, estimate, plain, h, limit)[: -m - len(h)], rtol=1e-6, atol=1e-9
+        )
+
+
+def trusted(bank, estimate, plain, h, limit):
+    """What plans start from: the mixture, as far as h casts no doubt on the model, and else the plain filter."""
+    plan = 0.0
+    fading = np.zeros(bank.planning_model.n_states - len(plain.x))
+    of_plain = np.concatenate([plain.x, fading, plain.input_disturbance, plain.output_disturbance])
+    share = 0.0
+    for b, (weight, member) in enumerate(zip(estimate.weights, bank.members, strict=True)):
+        S = member.C @ member.covariance @ member.C.T + member.noise
+        share += weight / (1 + h**2 @ np.diag(np.linalg.inv(S)) / len(h) / limit)
+        plan = plan + weight * bank.to_plan(b) @ estimate.members[b]
+    return share * plan + (1 - share) * of_plain
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -261,7 +276,7 @@ def test_states_in_any_units_have_the_same_gains(units):
             estimate = bank.update(
                 estimate, np.full(2, u), np.array([0.3, -0.2]) * y, nothing, nothing
             ).estimate
-        loads.append(bank.loads_of(estimate))
+        loads.append(bank.loads_of(estimate)[: bank.loads.count])
     np.testing.assert_allclose(loads[1], loads[0], rtol=1e-9)
 
 

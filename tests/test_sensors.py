@@ -120,6 +120,22 @@ def test_a_jump_that_stays_is_believed_after_some_samples():
     assert abs(outputs[-1] - reference)[0] < 0.5
 
 
+@pytest.mark.parametrize("taken", [0.9, 0.0])
+def test_an_output_that_goes_far_in_every_sample_is_believed_where_its_model_takes_it(taken):
+    """An integrator at full speed gets further in a sample than `largest_jump`."""
+    model = mampc.StateSpace([[1.0]], [[1.0]], [[1.0]], None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=10, control_horizon=2, limits=mampc.Limits(u_min=-1.0, u_max=1.0)
+    )
+    checks = mampc.SensorChecks(largest_jump=0.5, confirm=3).fitted(problem)
+    state, found = checks.initial(np.zeros(1)), []
+    for k in range(5):
+        y, innovation, movement = np.array([5.0 + k]), np.array([5.0 + 0.1 * k]), np.array([taken])
+        judged, state = checks.update(state, y, innovation, movement, np.zeros(1))
+        found.append(bool(judged.believed[0]))
+    assert found == [False, False, taken > 0, taken > 0, taken > 0]
+
+
 def test_a_sensor_that_says_something_else_at_every_sample_is_never_believed():
     regulator = tank_regulator()
     swing = np.array([50.0, 0.0])

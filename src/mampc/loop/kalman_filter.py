@@ -51,7 +51,7 @@ class KalmanFilter(Estimator):
         self._A, self._C = _augmented(model, directions)
         self._gains: dict[bytes, Array] = {}
         self.gain = self.gain_with(np.ones(model.n_outputs, dtype=bool))
-        self._update, self._parts = self._everyday()
+        self.map, self._parts = self._everyday()
 
     def __repr__(self) -> str:
         at_inputs = int(self.directions.at_inputs.any(axis=0).sum())
@@ -166,7 +166,7 @@ class KalmanFilter(Estimator):
         )
         if not is_usable(known):
             return None
-        data = self._update.dot(known)
+        data = self.map.dot(known)
         if not is_usable(data):
             return None
         x, at_outputs, at_inputs, innovation, movement = self._parts
@@ -176,7 +176,7 @@ class KalmanFilter(Estimator):
         """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
         ones = np.ones((len(y), 1))
         known = (last.x, last.output_disturbance, last.input_disturbance, u, v_last, v, y, ones)
-        data = np.concatenate(known, axis=1) @ self._update.T
+        data = np.concatenate(known, axis=1) @ self.map.T
         x, at_outputs, at_inputs, innovation, movement = (data[:, part] for part in self._parts)
         return Updated(Estimate(x, at_outputs, at_inputs), innovation, movement)
 

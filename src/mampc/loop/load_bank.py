@@ -10,10 +10,11 @@ with the innovation e_b of filter b and its covariance S_b. These hold up to one
 tell: loads are told in units of the noise, so noise that was told wrongly changes no gain.
 
 A plant may do what inputs ask for later, or more or less of it, than its model says. By what the inputs' moves of the
-last samples did to the outputs, h, their innovations may be off: these vary by 1 + h' diag(S_b^-1) h / l times as much,
-and what is corrected falls by as much, to a tenth at least. Three standard deviations are forgiven: what no such
-error explains is corrected; loads, and what goes on by itself, are followed at once. The factor of the noise counts up
-to one here: errors of the model, which make it larger, are no reason for less caution.
+last samples did to the outputs, h, their innovations may be off: these vary by 1 / t_b = 1 + h' diag(S_b^-1) h / l
+times as much, and what is corrected falls by as much. Meanwhile plans count on the bank with the weight
+t = sum_b mu_b t_b, and for the rest on the plain filter that a regulator would have without a bank: that one follows
+slowly, and in one way whatever happens, so that a wrong model costs little more with a bank than without. The factor of
+the noise counts up to one here: errors of the model, which make it larger, are no reason for less caution.
 
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
@@ -28,20 +29,17 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
+from mampc.loop.doubt import moves_of_late
 from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.guessed_noise import guessed_noise
-from mampc.loop.hypotheses import HYPOTHESES, RUNS_AWAY, Hypothesis, Loads, Member
-from mampc.loop.mixing import IMPOSSIBLE, BankEstimate, Filters, Mixing
+from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
+from mampc.loop.kalman_filter import KalmanFilter
+from mampc.loop.mixing import BankEstimate, Filters, Mixing, filters_of, together
 from mampc.program.problem import TrackingProblem
 from mampc.systems.noise import white_noise
 from mampc.systems.state_space import StateSpace, as_discrete
 
 NOISE_TOLD, NOISE_GUESSED = 10.0, 2.0  # samples' worth of what is told or guessed of the noise
-
-LATE = 5.0  # samples since when inputs' moves make a model doubtful, of those that count less and less
-FORGIVEN = 3.0  # standard deviations of that
-DOUBTED = 10.0  # times as much as otherwise innovations vary at most
-SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 
 _ONE = np.ones(1)
 
@@ -93,23 +91,28 @@ class LoadBank(Estimator):
             self.members = [Member(hypothesis, self.loads) for hypothesis in self.hypotheses]
         except MampcError as error:
             raise MampcError(f"LoadBank: {error}") from None
+        self.plain = KalmanFilter.offset_free(model, measurement_noise=sizes)
         self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
         self._planning_model = self.loads.with_fading(self._kept) if self._kept else model
         self._mixing = Mixing(np.array([h.load is LoadKind.JUMPS for h in self.hypotheses]))
-        self._per_output = np.ones(model.n_outputs)
+        self._per_output, self._of_all = np.ones(model.n_outputs), np.ones(len(self.members))
         self._A = np.stack([member.A for member in self.members])
         self._C = np.stack([member.C for member in self.members])
         self._plans = np.stack([self.to_plan(b) for b in range(len(self.members))])
         l, m = model.n_outputs, model.n_inputs
         self._parts = slice(0, -m - l), slice(-m - l, -l), slice(-l, None)  # x, d_u and d_y in these
         self._mixture = np.vstack([plan.T for plan in self._plans])
+        # From (x, d_y, d_u) of the plain filter to (x, fading loads, d_u, d_y).
+        same, fading = np.eye(model.n_states + l + m), self._planning_model.n_states - model.n_states
+        x, d_y, d_u = np.split(same, np.cumsum([model.n_states, l]), axis=1)
+        self._plain_part = np.hstack([x, np.zeros((len(same), fading)), d_u, d_y])
         self._filters: dict[bytes, Filters] = {}
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
-        self._of_late, self._moved = self._moves(), slice(model.n_states, model.n_states + l)
+        self._of_late, self._moved = moves_of_late(model), slice(model.n_states, model.n_states + l)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         self._of_states, self._of_known = self._everyday()
-        self._together = _together(self._of_states, self._of_known)
+        self._together = together(self._of_states, self._of_known)
 
     @classmethod
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
@@ -159,19 +162,21 @@ class LoadBank(Estimator):
         return self.hypotheses[int(_bank(estimate).weights.argmax())].load
 
     def loads_of(self, estimate: Estimate) -> Array:
-        """The loads of the mixture, shape (k,), in sizes that show in the outputs like their noise."""
+        """Loads of the mixture (k,), in sizes that show in the outputs like their noise, and of the plain filter."""
         bank, members = _bank(estimate), _bank(estimate).members[..., self._of_loads]
         one = bank.weights.ndim == 1
         loads: Array = bank.weights.dot(members) if one else np.einsum("sb,sbz->sz", bank.weights, members)
-        return loads
+        return np.concatenate((loads, bank.plain[..., self.model.n_states :]), axis=-1)
 
     def with_loads(self, estimate: Estimate, stuck: BoolArray, loads: Array) -> Estimate:
-        """The estimate with the loads (k,) of before the outputs `stuck` (l,) were; see `Estimator`."""
-        bank, n = _bank(estimate), self.model.n_states
+        """The estimate with the loads of before the outputs `stuck` (l,) were; see `Estimator`."""
+        bank, n, k = _bank(estimate), self.model.n_states, self.loads.count
         members = bank.members.copy()
-        members[:, n : n + self.loads.count] = loads[int(stuck.argmax())]
-        members[:, n + self.loads.count :] = 0.0
-        return self._estimate(members, bank.weights, bank.usual, bank.scale, bank.late)
+        members[:, n : n + k] = loads[int(stuck.argmax()), :k]
+        members[:, n + k :] = 0.0
+        plain = _flat(self.plain.with_loads(self._plain_of(bank), stuck, loads[:, k:]))
+        trust = self._trust(bank.late, bank.scale, self._everything)
+        return self._estimate(members, bank.weights, bank.usual, bank.scale, bank.late, plain, trust)
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
         """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
@@ -197,39 +202,46 @@ class LoadBank(Estimator):
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
         late = np.concatenate([np.zeros(len(self._of_late) - len(u)), u])
         scale = np.array([1.0, self._told])
-        return self._estimate(members, usual @ self._mixing.chances, usual, scale, late)
+        plain = _flat(self.plain.initial(u, y, v))
+        chances = usual @ self._mixing.chances
+        return self._estimate(members, chances, usual, scale, late, plain, np.ones(len(usual)))
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
         bank, l = _bank(last), len(y)
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
-        known = np.concatenate((mixed.ravel(), u, v_last, v, y, _ONE, bank.late))
+        known = np.concatenate((mixed.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain))
+        beside = len(bank.late) + len(bank.plain)
         if not is_usable(known):
             return None
         if self._together is None:
             each = self._of_known.dot(known[mixed.size :])
-            each[: -len(bank.late)] += np.matmul(self._of_states, mixed[:, :, None]).ravel()
+            each[:-beside] += np.matmul(self._of_states, mixed[:, :, None]).ravel()
         else:
             each = self._together.dot(known)
         if not is_usable(each):
             return None
-        each, late = each[: -len(bank.late)].reshape(len(c), -1), each[-len(bank.late) :]
+        late, plain = each[-beside : -len(bank.plain)], each[-len(bank.plain) :]
+        each = each[:-beside].reshape(len(c), -1)
         seen = c.dot(each[:, 2 * mixed.shape[1] : -l])  # innovation and movement of the mixture
-        estimate = self._weighed(*self._split(each), late, c, bank, self._everything)
+        estimate = self._weighed(*self._split(each), late, plain, c, bank, self._everything)
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
         """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
         bank = _bank(last)
-        known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1)), bank.late), axis=1)
+        known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1)), bank.late, bank.plain), axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
             c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
-            n_z, l, n_late = mixed.shape[2], y.shape[1], bank.late.shape[1]
+            n_z, l = mixed.shape[2], y.shape[1]
+            plain_at = -bank.plain.shape[1]
+            late_at = plain_at - bank.late.shape[1]
             of_known = known @ self._of_known.T
-            each, late = of_known[:, :-n_late].reshape(len(y), len(self.members), -1), of_known[:, -n_late:]
+            late, plain = of_known[:, late_at:plain_at], of_known[:, plain_at:]
+            each = of_known[:, :late_at].reshape(len(y), len(self.members), -1)
             each += np.matmul(self._of_states, mixed[..., None])[..., 0]
             seen = np.einsum("sb,sbi->si", c, each[:, :, 2 * n_z : -l])
-            estimate = self._weighed(*self._split(each), late, c, bank, self._everything)
+            estimate = self._weighed(*self._split(each), late, plain, c, bank, self._everything)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
     def _split(self, each: Array) -> tuple[Array, Array, Array]:
@@ -238,15 +250,15 @@ class LoadBank(Estimator):
         return each[..., :n_z], each[..., n_z : 2 * n_z], each[..., -l:]
 
     def _everyday(self) -> tuple[Array, Array]:
-        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1, late) to all that `update` needs.
+        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1, late, plain) to all that `update` needs.
 
         For each hypothesis: z predicted, its correction, innovation, movement of the outputs, innovation made white.
-        And behind these, of what is known alone, the next `late`.
+        And behind these, of what is known alone, the next `late` and `plain`.
         """
         model = self.model
         n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
-        sizes = (m, d, d, l, 1, len(self._of_late))
-        u, v_last, v, y, one, late = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
+        sizes = (m, d, d, l, 1, len(self._of_late), n + l + m)
+        u, v_last, v, y, one, late, plain = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
         op = np.outer(model.all_inputs_op, one)
         drive = model.B @ (np.vstack([u, v_last]) - op)
         surplus = y - np.outer(model.y_op, one) - model.D @ (np.vstack([u, v]) - op)
@@ -259,7 +271,8 @@ class LoadBank(Estimator):
             seen = -C @ A
             of_states.append(np.vstack([A, K @ seen, seen, moved, W @ seen]))
             of_known.append(np.vstack([driven, K @ innovation, innovation, model.C @ drive, W @ innovation]))
-        return np.stack(of_states), np.vstack([*of_known, self._of_late @ np.vstack([late, u])])
+        of_plain = self.plain.map[: n + l + m] @ np.vstack([plain, u, v_last, v, y, one])
+        return np.stack(of_states), np.vstack([*of_known, self._of_late @ np.vstack([late, u]), of_plain])
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since."""
@@ -268,7 +281,9 @@ class LoadBank(Estimator):
         members = np.matmul(self._A, mixed[:, :, None])[:, :, 0]
         members[:, : model.n_states] += model.B @ self._change(u, v)
         late = self._of_late.dot(np.concatenate((bank.late, u)))
-        return self._estimate(members, c, bank.usual, bank.scale, late)
+        plain = _flat(self.plain.predict(self._plain_of(bank), u, v))
+        trust = self._trust(late, bank.scale, self._everything)
+        return self._estimate(members, c, bank.usual, bank.scale, late, plain, trust)
 
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
         """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
@@ -287,23 +302,24 @@ class LoadBank(Estimator):
         each = innovation + bank.weights @ seen - seen
         correction = np.matmul(filters.gains, each[:, :, None])[:, :, 0]
         white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
-        return self._weighed(bank.members, correction, white, bank.late, bank.weights, bank, filters)
+        plain, model = self._plain_of(bank), self.model
+        of_plain = (
+            model.C @ plain.x
+            + model.D[:, : model.n_inputs] @ plain.input_disturbance
+            + plain.output_disturbance
+        )
+        off = np.where(believed, innovation + bank.weights @ seen - of_plain, 0.0)
+        corrected = _flat(self.plain.corrected(plain, off, believed))
+        return self._weighed(
+            bank.members, correction, white, bank.late, corrected, bank.weights, bank, filters
+        )
 
     def filters(self, believed: BoolArray) -> Filters:
         """The gains where only some outputs, bool (l,), are believed."""
         key = believed.tobytes()
         filters = self._filters.get(key)
         if filters is None:
-            whiten = np.zeros((len(self.members), len(believed), len(believed)))
-            log_scale = np.zeros(len(self.members))
-            for b, member in enumerate(self.members):
-                root = np.linalg.cholesky(member.innovation_covariance(believed))
-                whiten[b][np.ix_(believed, believed)] = np.linalg.inv(root)
-                log_scale[b] = -np.log(np.diag(root) / self.noise[believed]).sum()
-            gains = np.stack([member.gain(believed) for member in self.members])
-            filters = self._filters[key] = Filters(
-                gains, whiten, np.square(whiten).sum(axis=1), log_scale, int(believed.sum())
-            )
+            filters = self._filters[key] = filters_of(self.members, self.noise, believed)
         return filters
 
     def _weighed(
@@ -312,6 +328,7 @@ class LoadBank(Estimator):
         correction: Array,
         white: Array,
         late: Array,
+        plain: Array,
         c: Array,
         bank: BankEstimate,
         filters: Filters,
@@ -321,15 +338,11 @@ class LoadBank(Estimator):
         Args:
             members, correction: predicted, and what innovations alone would add to them, shape (..., B, n + 2k).
             white: innovations made white, shape (..., B, l).
-            late: of the estimate, as predicted.
+            late, plain: of the estimate, predicted, and the latter corrected.
             c: how likely each hypothesis was before, shape (..., B).
         """
-        believed, h = max(filters.believed, 1), np.square(late[..., self._moved])
         surprise = np.square(white).dot(self._per_output)
-        moved = filters.precisions.dot(h) if h.ndim == 1 else h @ filters.precisions.T
-        forgiven = FORGIVEN * np.sqrt(moved / np.maximum(surprise, IMPOSSIBLE))
-        trust = np.maximum(1 / (1 + moved / (believed * np.minimum(bank.scale[..., :1], 1.0))), 1 - forgiven)
-        trust = np.maximum(trust, 1 / DOUBTED)
+        trust = self._trust(late, bank.scale, filters)
         surprise *= trust
         log_scale = filters.log_scale + 0.5 * filters.believed * np.log(trust)
         after = self._mixing.one if late.ndim == 1 else self._mixing.many
@@ -337,29 +350,46 @@ class LoadBank(Estimator):
             members + trust[..., None] * correction,
             *after(c, surprise, log_scale, filters.believed, bank.usual, bank.scale),
             late,
+            plain,
+            trust,
         )
 
-    def _moves(self) -> Array:
-        """From `late` and the inputs u (m,) applied since to the next `late`, shape (n + l + m, n + l + 2m).
-
-        A plant with modes that grow cannot wait: there it stays zero.
-        """
-        model = self.model
-        n, m, l = model.n_states, model.n_inputs, model.n_outputs
-        kept, grows = np.exp(-1 / LATE), np.abs(model.poles()).max(initial=0.0) > 1 + RUNS_AWAY
-        x, h, before, u = np.split(np.eye(n + l + 2 * m), np.cumsum([n, l, m]))
-        moves = 0.0 * u if grows else u - before
-        x = kept * model.A @ x + model.B[:, :m] @ moves
-        return np.vstack([x, kept * (h + model.C @ x + model.D[:, :m] @ moves), u])
+    def _trust(self, late: Array, scale: Array, filters: Filters) -> Array:
+        """t of every hypothesis beside what the inputs' last moves did, shape (..., B)."""
+        h = np.square(late[..., self._moved])
+        moved = filters.precisions.dot(h) if h.ndim == 1 else h @ filters.precisions.T
+        trust: Array = 1 / (1 + moved / (max(filters.believed, 1) * np.minimum(scale[..., :1], 1.0)))
+        return trust
 
     def _estimate(
-        self, members: Array, weights: Array, usual: Array, scale: Array, late: Array
+        self,
+        members: Array,
+        weights: Array,
+        usual: Array,
+        scale: Array,
+        late: Array,
+        plain: Array,
+        trust: Array,
     ) -> BankEstimate:
-        plan = (weights[..., None] * members).reshape((*weights.shape[:-1], -1)).dot(self._mixture)
+        t = (weights * trust).dot(self._of_all)[..., None]
+        plan = t * (weights[..., None] * members).reshape((*weights.shape[:-1], -1)).dot(self._mixture)
+        plan = plan + (1 - t) * plain.dot(self._plain_part)
         x, at_inputs, at_outputs = self._parts
         return BankEstimate(
-            plan[..., x], plan[..., at_outputs], plan[..., at_inputs], members, weights, usual, scale, late
+            plan[..., x],
+            plan[..., at_outputs],
+            plan[..., at_inputs],
+            members,
+            weights,
+            usual,
+            scale,
+            late,
+            plain,
         )
+
+    def _plain_of(self, bank: BankEstimate) -> Estimate:
+        n, l = self.model.n_states, self.model.n_outputs
+        return Estimate(bank.plain[:n], bank.plain[n : n + l], bank.plain[n + l :])
 
     def _seen(self, members: Array) -> Array:
         """The outputs of every hypothesis beside those of the inputs, shape (B, l)."""
@@ -373,17 +403,8 @@ class LoadBank(Estimator):
         return change
 
 
-def _together(blocks: Array, beside: Array) -> Array | None:
-    """Blocks (B, rows, columns) along the diagonal of one matrix, and beside them another one; None if not small."""
-    count, rows, columns = blocks.shape
-    if len(beside) * count * columns > SMALL:
-        return None
-    diagonal = np.zeros((count, rows, count, columns))
-    diagonal[np.arange(count), :, np.arange(count)] = blocks
-    matrix = np.zeros((len(beside), count * columns + beside.shape[1]))
-    matrix[: count * rows, : count * columns] = diagonal.reshape(count * rows, count * columns)
-    matrix[:, count * columns :] = beside
-    return matrix
+def _flat(estimate: Estimate) -> Array:
+    return np.concatenate((estimate.x, estimate.output_disturbance, estimate.input_disturbance))
 
 
 def _bank(estimate: Estimate) -> BankEstimate:

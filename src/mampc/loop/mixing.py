@@ -7,6 +7,7 @@ and how many samples have shown it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.loop.estimator import Estimate
+from mampc.loop.hypotheses import Member
 
 STAYS = 0.998  # chance that a load goes on as it does
 TO_JUMP = 0.001  # chance that it jumps; what is left goes to the other hypotheses
@@ -23,6 +25,7 @@ LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
 NOISE_REMEMBERED = 100.0  # and of what is seen of it
 NOISE_RANGE = (0.01, 100.0)  # of the variance, beside what was told
 UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
+SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 IMPOSSIBLE = 1e-300  # no hypothesis is less likely, so that some are left whatever comes
 
 
@@ -39,6 +42,7 @@ class BankEstimate(Estimate):
         scale: variance of the innovations beside what the noise told leads to, and how many samples have shown it.
         late: what the inputs' moves of the last samples did to the states (n,) and to the outputs (l,), and the inputs
             (m,) since, shape (n + l + m,).
+        plain: x, d_y and d_u of the plain filter, shape (n + l + m,).
     """
 
     members: Array
@@ -46,6 +50,7 @@ class BankEstimate(Estimate):
     usual: Array
     scale: Array
     late: Array
+    plain: Array
 
 
 class Filters(NamedTuple):
@@ -64,6 +69,18 @@ class Filters(NamedTuple):
     precisions: Array
     log_scale: Array
     believed: int
+
+
+def filters_of(members: Sequence[Member], noise: Array, believed: BoolArray) -> Filters:
+    """Those of members with noise (l,) in their outputs, where only some of these, bool (l,), are believed."""
+    whiten = np.zeros((len(members), len(believed), len(believed)))
+    log_scale = np.zeros(len(members))
+    for b, member in enumerate(members):
+        root = np.linalg.cholesky(member.innovation_covariance(believed))
+        whiten[b][np.ix_(believed, believed)] = np.linalg.inv(root)
+        log_scale[b] = -np.log(np.diag(root) / noise[believed]).sum()
+    gains = np.stack([member.gain(believed) for member in members])
+    return Filters(gains, whiten, np.square(whiten).sum(axis=1), log_scale, int(believed.sum()))
 
 
 class Mixing:
@@ -149,3 +166,16 @@ def _shared(places: BoolArray) -> Array:
     """Every row's chance of one, shared by its places; zeros in rows without any."""
     count: Array = places.sum(axis=1, keepdims=True).astype(np.float64)
     return places / np.maximum(count, 1.0)
+
+
+def together(blocks: Array, beside: Array) -> Array | None:
+    """Blocks (B, rows, columns) along the diagonal of one matrix, and beside them another one; None if not small."""
+    count, rows, columns = blocks.shape
+    if len(beside) * count * columns > SMALL:
+        return None
+    diagonal = np.zeros((count, rows, count, columns))
+    diagonal[np.arange(count), :, np.arange(count)] = blocks
+    matrix = np.zeros((len(beside), count * columns + beside.shape[1]))
+    matrix[: count * rows, : count * columns] = diagonal.reshape(count * rows, count * columns)
+    matrix[:, count * columns :] = beside
+    return matrix

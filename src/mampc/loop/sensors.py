@@ -11,8 +11,8 @@ Every test is made against what the model predicts, since only that tells a faul
   again once it changes; or, where no other output is believed either, after ten times `stuck_after` samples, since
   a plant at a hard stop (a tank that overflows) looks the same;
 - jump: further from its prediction than `largest_jump`. Where it stays there (`confirm` samples within
-  `largest_jump` of one another), it is the plant that jumped, and it is believed, unless it is a hundred times
-  as far from the operating point as the inputs' whole range could move the output.
+  `largest_jump` of one another, or of where the model takes them), it is the plant that jumped, and it is believed,
+  unless it is a hundred times as far from the operating point as the inputs' whole range could move the output.
 
 An output has one fault at a time, the first in this order.
 """
@@ -184,7 +184,7 @@ class Sensors:
         if state.blind >= BELIEVED_AGAIN * self._stuck_after:
             repeats[stuck], moved[stuck], stuck = 0.0, 0.0, self._none
         jumped = came & ~stuck & (np.abs(innovation) > self._jump)
-        doubted = self._doubted(state, y, jumped)
+        doubted = self._doubted(state, y, movement, jumped)
         jump = jumped & (doubted < self._confirm)
         believed = came & ~stuck & ~jump
         after = SensorState(
@@ -237,9 +237,13 @@ class Sensors:
         stuck: BoolArray = (state.stuck != 0.0) | (long & moves)
         return stuck
 
-    def _doubted(self, state: SensorState, y: Array, jumped: BoolArray) -> Array:
-        """For how many samples in a row each output has jumped to about the same place, shape (l,)."""
-        near = (np.abs(y - state.y) <= self._jump) & (np.abs(y - self._y_op) < self._absurd)
+    def _doubted(self, state: SensorState, y: Array, movement: Array, jumped: BoolArray) -> Array:
+        """For how many samples in a row each output has jumped to about the same place, shape (l,).
+
+        From there it may go on as the model says: an integrator at full speed gets far in a sample.
+        """
+        gone = np.minimum(np.abs(y - state.y), np.abs(y - state.y - movement))
+        near = (gone <= self._jump) & (np.abs(y - self._y_op) < self._absurd)
         return np.where(jumped, 1.0 + np.where(near, state.doubted, 0.0), 0.0)
 
     def _longest(self, state: SensorState, changed: BoolArray) -> Array:

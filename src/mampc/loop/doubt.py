@@ -1,0 +1,37 @@
+"""What casts doubt on a model: the inputs' moves of the last samples, by what they did to the outputs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mampc.base.checks import Array
+from mampc.systems.state_space import StateSpace
+
+LATE = 3.0  # samples since when moves make a model doubtful, of those that count less and less
+LONG = 512  # samples after which what runs away has done so
+
+
+def moves_of_late(model: StateSpace) -> Array:
+    """From `BankEstimate.late` and the inputs u (m,) applied since to the next one, shape (n + l + m, n + l + 2m).
+
+    A plant that runs away cannot wait: there moves cast no doubt.
+    """
+    n, m, l = model.n_states, model.n_inputs, model.n_outputs
+    kept = np.exp(-1 / LATE)
+    x, h, before, u = np.split(np.eye(n + l + 2 * m), np.cumsum([n, l, m]))
+    moves = 0.0 * u if runs_away(model) else u - before
+    x = kept * model.A @ x + model.B[:, :m] @ moves
+    return np.vstack([x, kept * (h + model.C @ x + model.D[:, :m] @ moves), u])
+
+
+def runs_away(model: StateSpace) -> bool:
+    """Whether outputs go ever faster after a pulse at some input: modes that grow, or integrators in a row."""
+    pulse = model.B[:, : model.n_inputs]
+    early = np.abs(np.diff(model.step_response(model.n_states + 2)[:, :, : model.n_inputs], axis=0)).max(
+        axis=0
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        power = np.linalg.matrix_power(model.A, LONG)
+        once, twice = np.abs(model.C @ power @ pulse), np.abs(model.C @ power @ power @ pulse)
+        # Twice as long after a pulse, two integrators are twice as fast. What is left of other modes may be rounding.
+        return not (twice <= 1.5 * np.maximum(once, 1e-6 * early)).all()
