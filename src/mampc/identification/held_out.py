@@ -51,6 +51,12 @@ def errors(parts: Sequence[Part], records: Scaled, *, coloured: bool = False) ->
         fit = part.fit
         trends = fit_trends(part.A, part.C, fit.B, fit.D, own, degree=1, integrators=part.integrators)
         left = residuals(part.A, part.C, fit._replace(trends=trends), own)
+        # Initial states and lines explain some of it by themselves: where records are short, all of it.
+        count, l = own.samples * len(part.outputs), len(part.outputs)
+        spent = sum(min(len(u) * l, len(part.A) + 2 * l) for u in own.u)
+        if spent > count / 2:
+            return np.inf, 0.0, np.inf
+        left = [one * np.sqrt(count / (count - spent)) for one in left]
         tried = [left, *([whitened(one, pole)[1:] for one in left] for pole in POLES)]
         sizes = np.array([np.sqrt(np.mean(np.concatenate(one) ** 2, axis=0)) for one in tried])
         if coloured:
