@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from mampc import IOData, MampcError, StateSpace, n4sid, prbs
+from seeds import seeds
 
 UNITS = [(1.0, 1.0), (1e-4, 1e5)]
 
@@ -68,6 +69,23 @@ def test_slow_and_fast_channels_keep_their_states_under_coloured_noise():
     fitted = n4sid(IOData(u, clean + 0.3 * clean.std(axis=0) * noise, 1.0), feedthrough=False)
     error = np.abs(fitted.model.step_response(100) - plant.step_response(100)).max(axis=(0, 2))
     assert (error < 0.2 * np.abs(gain).max(axis=1)).all()
+
+
+@pytest.mark.parametrize("seed", seeds(4, quick=1))
+def test_changes_are_not_explained_where_coloured_noise_does_not_walk(seed):
+    """A plant that answers the wrong way first: from changes its gain would err by a quarter."""
+    poles = np.poly([np.exp(-0.1)] * 2)
+    zeros = np.array([1.0, -1.12]) * poles.sum() * 2.0 / -0.12
+    plant = StateSpace([[-poles[1], 1.0], [-poles[2], 0.0]], zeros[:, None], [[1.0, 0.0]], None, 1.0)
+    u = prbs(order=10, hold=6, samples=2000, seed=seed)
+    clean = plant.response(u)
+    rng = np.random.default_rng(seed)
+    noise = lfilter([np.sqrt(1 - 0.81)], [1.0, -0.9], rng.standard_normal(clean.shape), axis=0)
+    noise = noise + 0.1 * rng.standard_normal(clean.shape)
+    fitted = n4sid(IOData(u, clean + 0.3 * clean.std() * noise, 1.0), feedthrough=False)
+    error = np.abs(fitted.model.step_response(80) - plant.step_response(80)).max()
+    assert fitted.detrend != "differences"
+    assert error < 0.1 * 2.0
 
 
 @pytest.mark.parametrize("detrend", ["whitened", "differences", "linear"])

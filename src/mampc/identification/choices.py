@@ -16,7 +16,18 @@ from mampc.identification.closed_loop import estimate_predictor
 from mampc.identification.delays import Integers, find_delays
 from mampc.identification.estimate import Settings, estimate
 from mampc.identification.fir import estimate_fir
-from mampc.identification.held_out import AS_GOOD, CLEARLY, RIVAL, WALK, compared, errors, split
+from mampc.identification.held_out import (
+    AS_GOOD,
+    CLEARLY,
+    NOTHING,
+    RIVAL,
+    ROOT,
+    WALK,
+    Errors,
+    compared,
+    errors,
+    split,
+)
 from mampc.identification.parts import Part, groups
 from mampc.identification.scaling import Scaled
 
@@ -27,9 +38,16 @@ TRENDS = {
     "differences": "changes were explained, as outputs that drift ask for",
     "whitened": "disturbances were made white first, as their colour or a loop that was closed ask for",
 }
-COLOUR = {"whitened": -2, "differences": -1}  # which to take first where the disturbance is not white
 ENOUGH = 20_000  # samples in which choices are compared
 SHORT = 3  # samples of dead time that are left to the states
+WALKING = (
+    "differences",
+    "whitened",
+    "linear",
+    "constant",
+    "none",
+)  # what to take first where what is left may walk
+CHANCE = 4.0  # difference of log likelihoods that chance brings
 RIVALS = ("ARX", "FIR")  # for the poles of subspace models
 
 
@@ -50,13 +68,10 @@ class Choice:
 
 
 class Score(NamedTuple):
-    """Of a choice on held-out data: see `held_out.errors`; and how many integrators and states it takes."""
+    """Of a choice on held-out data, and how many integrators it takes."""
 
-    error: float
-    walk: float
-    level: float
+    errors: Errors
     integrators: int
-    states: int
 
 
 def estimated(
@@ -106,57 +121,51 @@ def chosen(
             trial = replace(settings, block_rows=min(s, settings.block_rows))
             parts = estimated(front, trial, choice)
         except (MampcError, np.linalg.LinAlgError):
-            return Score(np.inf, 0.0, np.inf, 0, 0)
-        found = errors(parts, back, coloured=feedback)
-        return Score(*found, sum(part.integrators for part in parts), sum(len(part.A) for part in parts))
+            return Score(NOTHING, 0)
+        return Score(errors(parts, back), sum(part.integrators for part in parts))
 
     trends = ("constant", "linear", "differences") if detrend == "auto" else (detrend,)
     choices = [Choice(trend, found) for trend in trends]
     scores = [scored(choice) for choice in choices]
     # White disturbances come with orders of their own, where none is asked for.
-    if detrend == "auto" and (feedback or (settings.order is None and scores[0].walk > WALK)):
+    if detrend == "auto" and (feedback or (settings.order is None and scores[0].errors.walk > WALK)):
         trends = (*trends, "whitened")
         choices.append(Choice("whitened", found))
         scores.append(scored(choices[-1]))
     # Where inputs excite too little for anything else, white disturbances say nothing.
     telling = [score for trend, score in zip(trends, scores, strict=True) if trend != "whitened"] or scores
-    if not any(np.isfinite(score.error) for score in telling):
+    if not any(np.isfinite(score.errors.ahead) for score in telling):
         why = "Too short to hold a part out, so that nothing was compared"
         return Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
-    # A drift passes for an integrator that inputs hardly move: the fewest of these win. Among equals disturbances are
-    # made white where they are not; else the simplest trend wins.
+    # A drift passes for an integrator that inputs hardly move: the fewest of these win among those that predict alike.
+    # Where what is left may walk, levels say little: changes are explained. Elsewhere what predicts best wins, the
+    # simplest of what chance cannot tell apart.
     # Levels say nothing under feedback: inputs answer disturbances.
-    first = scores[0]
+    first = scores[0].errors
 
-    def is_fair(k: int) -> bool:
-        score = scores[k]
-        if k == 0:
-            return True
+    def is_fair(found: Errors) -> bool:
         if feedback:
-            return bool(np.isfinite(score.error))
-        if trends[k] == "whitened":
-            return min(score.walk, first.walk) > WALK and score.level <= first.level + RIVAL
-        return score.level <= first.level + CLEARLY or score.error < first.error - CLEARLY
+            return bool(np.isfinite(found.ahead))
+        return found.level <= first.level + CLEARLY or found.ahead < first.ahead - CLEARLY
 
-    fair = [k for k in range(len(trends)) if is_fair(k)]
-    least = min(scores[k].error for k in fair)
-    near = [k for k in fair if scores[k].error <= least + AS_GOOD]
-    walks = scores[near[0]].walk > WALK
+    def rank(k: int) -> tuple[bool, int]:
+        return feedback and trends[k] != "whitened", scores[k].integrators
 
-    def rank(k: int) -> tuple[bool, int, int, int]:
-        white = feedback and trends[k] != "whitened"
-        return white, scores[k].integrators, COLOUR.get(trends[k], 0) if walks else 0, k
-
-    best = min(near, key=rank)
-    choice, score = choices[best], scores[best].error
+    near = _within(AS_GOOD, [k for k in range(len(trends)) if k == 0 or is_fair(scores[k].errors)], scores)
+    near = [k for k in near if rank(k) == min(map(rank, near))]
+    if first.walk > WALK and max(scores[k].errors.root for k in near) > ROOT:
+        best = min(near, key=lambda k: WALKING.index(trends[k]))
+    else:
+        best = _within(min(AS_GOOD, CHANCE / (l * back.samples)), near, scores)[0]
+    choice, score = choices[best], scores[best].errors.ahead
     said = f"Trend: {TRENDS[choice.trend]}"
     if feedback:
         said += "; past outputs moved the inputs"
     if best:
-        said += f"; this predicts held-out data {compared(score, scores[0].error)} constants"
+        said += f"; this predicts held-out data {compared(score, scores[0].errors.ahead)} constants"
     notes.append(f"{said}.")
     if delays is None and found.any():
-        without = scored(replace(choice, delays=none)).error
+        without = scored(replace(choice, delays=none)).errors.ahead
         if without < score - AS_GOOD:
             choice, score = replace(choice, delays=none), without
         else:
@@ -165,7 +174,7 @@ def chosen(
                 f"Dead times of {spans} samples; they predict held-out data {compared(score, without)} none."
             )
     if settings.order is None and choice.trend != "whitened":
-        rivals = {poles: scored(replace(choice, poles=poles)).error for poles in RIVALS}
+        rivals = {poles: scored(replace(choice, poles=poles)).errors.ahead for poles in RIVALS}
         best_rival = min(RIVALS, key=lambda poles: rivals[poles])
         if rivals[best_rival] < score - RIVAL:
             choice = replace(choice, poles=best_rival)
@@ -175,6 +184,12 @@ def chosen(
         said = " and ".join(f"{compared(own, error)} {poles} ones" for poles, error in rivals.items())
         notes.append(f"{choice.poles[0].upper()}{choice.poles[1:]} poles; they predict held-out data {said}.")
     return replace(choice, notes=tuple(notes))
+
+
+def _within(margin: float, candidates: Sequence[int], scores: Sequence[Score]) -> list[int]:
+    """Those of the candidates whose errors are no larger than the least by more than a margin."""
+    least = min(scores[k].errors.ahead for k in candidates)
+    return [k for k in candidates if scores[k].errors.ahead <= least + margin]
 
 
 def block_rows_for(samples: list[int], m: int, l: int, order: int | None, block_rows: int | None) -> int:

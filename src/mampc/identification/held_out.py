@@ -1,8 +1,12 @@
-"""What predicts held-out data: trends, dead times and rivals compared on the part of the records kept back."""
+"""What predicts held-out data: trends, dead times and rivals compared on the part of the records kept back.
+
+Source of the test for a random walk: Dickey and Fuller, J. Amer. Stat. Assoc. 74 (1979).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +24,7 @@ AS_GOOD = 0.01  # logarithm of errors that are as good as equal
 RIVAL = 0.03  # by which a rival must be better
 CLEARLY = 0.3  # by which simulated levels must not be worse
 WALK = 0.45  # by which a random walk must explain what is left better than white noise, to be one
+ROOT = -2.86  # above which what is left may walk (Fuller's table, with a constant, one in twenty)
 
 
 def split(records: Scaled) -> tuple[Scaled, Scaled]:
@@ -31,23 +36,40 @@ def split(records: Scaled) -> tuple[Scaled, Scaled]:
     return front, back
 
 
-def errors(parts: Sequence[Part], records: Scaled, *, coloured: bool = False) -> tuple[float, float, float]:
-    """The logarithm of the error of predictions one sample ahead, a mean over outputs.
+class Errors(NamedTuple):
+    """Of predictions of held-out data, as logarithms, means over outputs.
 
-    The parts are simulated from initial states that fit, a line in time set aside. What they leave is
-    predicted as white noise and a random walk, in the proportion that suits it best: a drift says nothing about
-    a model of what the inputs do. With `coloured` it may also be predicted from its own last values: under feedback
-    a model that mistakes the controller for the plant explains a disturbance of another colour.
-
-    Returns:
-        that, by how much it is smaller than without a walk, and the same of simulated levels.
+    Attributes:
+        ahead: of predictions one sample ahead.
+        walk: by how much a random walk explains what is left better than white noise.
+        level: of simulated levels.
+        root: statistic of Dickey and Fuller of what is left: far below zero unless it walks.
     """
+
+    ahead: float
+    walk: float
+    level: float
+    root: float
+
+
+NOTHING = Errors(np.inf, 0.0, np.inf, -np.inf)
+
+
+def errors(parts: Sequence[Part], records: Scaled) -> Errors:
+    """How well parts of a model predict records.
+
+    The parts are simulated from initial states that fit, a line in time set aside. What they leave is predicted as
+    white noise and a random walk, in the proportion that suits it best, or from its own last values: a disturbance says
+    nothing about a model of what the inputs do, whatever its colour.
+    """
+    roots: list[float] = []
     logs: list[float] = []
     levels: list[float] = []
+    walks: list[float] = []
     for part in parts:
         own = records_of_part(records, part.outputs, part.delays)
         if not own.u:
-            return np.inf, 0.0, np.inf
+            return NOTHING
         fit = part.fit
         trends = fit_trends(part.A, part.C, fit.B, fit.D, own, degree=1, integrators=part.integrators)
         left = residuals(part.A, part.C, fit._replace(trends=trends), own)
@@ -55,23 +77,26 @@ def errors(parts: Sequence[Part], records: Scaled, *, coloured: bool = False) ->
         count, l = own.samples * len(part.outputs), len(part.outputs)
         spent = sum(min(len(u) * l, len(part.A) + 2 * l) for u in own.u)
         if spent > count / 2:
-            return np.inf, 0.0, np.inf
+            return NOTHING
         left = [one * np.sqrt(count / (count - spent)) for one in left]
         tried = [left, *([whitened(one, pole)[1:] for one in left] for pole in POLES)]
         sizes = np.array([np.sqrt(np.mean(np.concatenate(one) ** 2, axis=0)) for one in tried])
-        if coloured:
-            sizes = np.vstack(
-                [sizes, [_unpredictable([one[:, i] for one in left]) for i in range(len(part.outputs))]]
-            )
-        sizes = np.log(np.maximum(sizes, ROUNDING))
+        own_past = [_from_last_values([one[:, i] for one in left]) for i in range(len(part.outputs))]
+        roots.extend(root for _, root in own_past)
+        sizes = np.log(np.maximum(np.vstack([sizes, [size for size, _ in own_past]]), ROUNDING))
         logs.extend(sizes.min(axis=0))
         levels.extend(sizes[0])
-    error, level = float(np.mean(logs)), float(np.mean(levels))
-    return error, level - error, level
+        walks.extend(sizes[0] - sizes[:-1].min(axis=0))
+    return Errors(*(float(np.mean(values)) for values in (logs, walks, levels, roots)))
 
 
-def _unpredictable(signals: Sequence[Array]) -> float:
-    """The standard deviation of what the last values of a signal do not predict; Akaike's final prediction error."""
+def _from_last_values(signals: Sequence[Array]) -> tuple[float, float]:
+    """What the last values of a signal leave of the next, and whether their coefficients sum to one.
+
+    Returns:
+        a standard deviation, by Akaike's final prediction error, and how many of its own standard deviations the sum
+        differs from one by (Dickey and Fuller); infinity and minus infinity where signals are too short.
+    """
     past, now = [], []
     for signal in signals:
         if len(signal) > 2 * PAST:
@@ -80,10 +105,15 @@ def _unpredictable(signals: Sequence[Array]) -> float:
             now.append(windows[:, PAST])
     count = sum(map(len, now))
     if count <= 4 * PAST:
-        return np.inf
+        return np.inf, -np.inf
     rows, target = np.concatenate(past), np.concatenate(now)
-    left = target - rows @ np.linalg.lstsq(rows, target)[0]
-    return float(np.sqrt(np.mean(left**2) * (count + PAST) / (count - PAST)))
+    gram = rows.T @ rows
+    inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
+    coefficients = inverse @ (rows.T @ target)
+    variance = np.mean((target - rows @ coefficients) ** 2)
+    certain = variance * inverse.sum()
+    root = (coefficients.sum() - 1.0) / np.sqrt(certain) if certain > 0 else -np.inf
+    return float(np.sqrt(variance * (count + PAST) / (count - PAST))), float(root)
 
 
 def compared(one: float, other: float) -> str:
