@@ -314,6 +314,21 @@ def test_units_decide_nothing(scale_u, scale_y):
         assert other.objective == pytest.approx(usual.objective, rel=1e-6)
 
 
+def test_bounds_of_branching_never_fall():
+    """Multipliers of a node may say less than those of the node it comes from."""
+    model = mampc.StateSpace(
+        [[1, 1, 0.5], [0, 1, 1], [0, 0, 1]], [[1 / 6, 0.3], [0.5, -0.2], [1, 0.4]], [[1, 0, 0]], None, 1.0
+    )
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=100, control_horizon=15, move_weight=1e-6,
+        limits=mampc.Limits(u_min=-1, u_max=1, du_max=0.2),
+    )  # fmt: skip
+    with pytest.warns(mampc.MampcWarning, match="condition"):
+        controller = mampc.MAMPC(problem, mampc.MoveRules(price=0.1), method=mampc.Exact(time_limit=0.2))
+    decision = controller.step(controller.initial_state(), np.array([0.06, -0.3, 0.15]), [1.0])
+    assert 0 <= decision.lower_bound <= decision.objective
+
+
 def test_out_of_time_branching_keeps_a_valid_bound():
     model = random_model(11, n=4, m=3, l=3)
     problem = mampc.TrackingProblem(

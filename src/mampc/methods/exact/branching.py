@@ -111,13 +111,13 @@ class Branching:
                 return []
         i = int(np.where(state == UNDECIDED, solved.out, -1.0).argmax())
         if state[i] != UNDECIDED:
-            return [(solved.bound, state)] if decided else []
+            return [(max(bound, solved.bound), state)] if decided else []
         children = []
         for kind, adds in ((OUT, solved.out[i]), (MADE, solved.made[i])):
             child = state.copy()
             child[i] = kind
             if solved.bound + adds < self._problem.cutoff and self._closed(child):
-                children.append((float(solved.bound + adds), child))
+                children.append((max(bound, float(solved.bound + adds)), child))
         return children
 
     def _split(self, bound: float, state: Indices) -> list[tuple[float, Indices]]:

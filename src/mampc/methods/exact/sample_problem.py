@@ -97,4 +97,7 @@ class SampleProblem:
 
     def offer_first(self, pattern: BoolArray) -> None:
         """Offer a plan on a pattern that will be visited again, to begin with."""
-        self._solver.offer(self.sample, pattern, self.best, self.deadline, first=True)
+        most = 1.0 if self.admissible.on_levels else np.inf
+        self.best.offer(
+            self._solver.solve(self.sample, pattern, self.best.objective, self.deadline, most=most)
+        )

@@ -30,7 +30,7 @@ from mampc.program.sample import Indices, Sample
 MOST_TERMS = 8  # that nodes are bounded with
 UNLIMITED = 1e15  # no limit of an input is as large
 UNEVEN = 1e4  # condition of U from which a step of refinement pays
-NORMAL_EQUATIONS = 1e7  # condition of U from which on normal equations have no digits left
+NORMAL_EQUATIONS = 1e6  # condition of U from which on normal equations have no digits left
 
 
 class Squares:
