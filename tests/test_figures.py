@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import mampc
+from mampc.base.drawing import outline
 from mampc.compare.sensitivity import SETTINGS, Point
 from mampc.loop.drawing import signals_figure
 from mampc.report.figures import (
@@ -182,3 +183,15 @@ def test_units_are_shown_and_kept_in_model_files(tmp_path):
 def test_units_of_no_signal_are_refused(units):
     with pytest.raises(mampc.MampcError, match=r"names.units: expected.*received"):
         mampc.Names(("u1",), ("y1",), units=units)
+
+
+def test_long_lines_are_drawn_by_their_largest_and_least_values():
+    rng = np.random.default_rng(0)
+    time, values = np.arange(50_001.0), rng.standard_normal(50_001)
+    values[12_345], values[-1] = 9.0, -9.0
+    x, y = outline(time, values)
+    assert len(x) <= 8000
+    assert (np.diff(x) > 0).all()
+    assert (y == values[x.astype(int)]).all()
+    assert {12_345.0, 50_000.0} <= set(x)
+    np.testing.assert_array_equal(outline(time[:100], values[:100])[1], values[:100])

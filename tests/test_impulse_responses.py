@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from mampc import IOData, MampcError, StateSpace, n4sid, prbs, validate
+from mampc import IOData, MampcError, StateSpace, n4sid, prbs
 from mampc.identification.choices import Choice, estimated
 from mampc.identification.estimate import Settings
 from mampc.identification.fir import impulse_responses
@@ -108,13 +108,3 @@ def test_records_too_short_for_impulse_responses_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(MampcError, match="expected records that hold impulse responses"):
         impulse_responses(scaled([IOData(rng.standard_normal(7), rng.standard_normal(7), 1.0)]), 0)
-
-
-def test_many_short_records_are_not_explained_by_the_initial_states_of_a_high_order():
-    rng = np.random.default_rng(1)
-    plant = StateSpace([[0.9]], [[1.0]], [[1.0]], None, 10.0)
-    u = prbs(order=9, hold=5)
-    y = plant.response(u) + 0.1 * rng.standard_normal((len(u), 1))
-    records = [IOData(u[k : k + 35], y[k : k + 35], 10.0) for k in range(0, 1400, 60)]
-    fitted = n4sid(records, feedthrough=False)
-    assert validate(fitted.model, IOData(u, y, 10.0)).fit[0] > 90

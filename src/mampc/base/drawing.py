@@ -5,6 +5,8 @@ from __future__ import annotations
 import textwrap
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 
@@ -101,3 +103,20 @@ def styled() -> Any:
 def plain(text: str, width: int = _LINE) -> str:
     """Text as matplotlib shows it literally, in lines that fit: a dollar sign starts no formula."""
     return textwrap.fill(text, width).replace("$", r"\$")
+
+
+def outline(time: Array, values: Array, most: int = 8000) -> tuple[Array, Array]:
+    """A line of at most about so many points: where there are more, the least and the largest of each stretch."""
+    if len(values) <= most:
+        return time, values
+    size = -(-2 * len(values) // most)
+    starts = np.arange(0, len(values), size)
+    ends = np.append(starts[1:], len(values))
+    kept = np.unique(
+        [
+            start + place(values[start:end])
+            for start, end in zip(starts, ends, strict=True)
+            for place in (np.argmin, np.argmax)
+        ]
+    )
+    return time[kept], values[kept]

@@ -15,6 +15,7 @@ from mampc.base.drawing import (
     VERMILION,
     legend_above,
     new_figure,
+    outline,
     plain,
     styled,
     time_scale,
@@ -134,8 +135,9 @@ def validation_figure(data: IOData, validation: Validation) -> Figure:
     with styled():
         figure, axes = new_figure(data.y.shape[1], sharex=True)
         for i, panel in enumerate(axes[:, 0]):
-            panel.plot(time / scale, data.y[:, i], color=GREY, label="measured")
-            panel.plot(time / scale, validation.y_hat[:, i], color=BLUE, label="simulated by the model")
+            panel.plot(*outline(time / scale, data.y[:, i]), color=GREY, label="measured")
+            simulated = outline(time / scale, validation.y_hat[:, i])
+            panel.plot(*simulated, color=BLUE, label="simulated by the model")
             name = data.names.with_unit(data.names.outputs[i])
             panel.set_title(plain(f"{name}, fit {validation.fit[i]:.1f} %"))
         axes[-1, 0].set_xlabel(f"time ({unit}), hold-out part of the record")
