@@ -150,7 +150,9 @@ def test_what_the_record_said_is_in_it():
         noise=Noise([0.1, 0.2], [0.01, 0.02]),
         evidence=Evidence([[45.0, 55.0], [30.0, 41.0]], [[0.0, 9.0], [0.0, 9.0]]),
     )
-    text = own_study(model, "m.json", "own")
+    stages = []
+    text = own_study(model, "m.json", "own", stages.append)
+    assert stages[0] == "trying price 1 of 5 at most"
     study = parse_study(text)
     assert (study.problem.limits.u_min, study.problem.limits.u_max) == ([45.0, 30.0], [55.0, 41.1])
     assert study.scenarios[1].noise == [0.1, 0.2]
