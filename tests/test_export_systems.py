@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import mampc
 from mampc import MampcError, read_export
 from mampc.identification.export import inspect_export
 from small_exports import U, Y, assert_whole, read, rows, stamps, text, told, write
@@ -136,3 +137,28 @@ def test_columns_with_few_values_are_told_before_any_is_named(tmp_path):
     seen = inspect_export(write(tmp_path, text(lines)))
     assert seen.columns[0].verdict == "has few values: stored on change?"
     assert any("--on-change" in note for note in seen.notes)
+
+
+def test_a_recorded_loop_is_a_record_to_identify_from(tmp_path):
+    model = mampc.StateSpace([[0.9]], [[0.1]], [[1.0]], None, dt=5.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=5, control_horizon=2)
+    regulator = mampc.Regulator(mampc.MPC(problem))
+    with mampc.Recorder(tmp_path / "loop.csv", regulator) as recorder:
+        state = regulator.initial_state()
+        for k in range(12):
+            state = recorder.step(state, [np.nan if k == 7 else 0.1 * k], [1.0]).state
+    export = read_export(tmp_path / "loop.csv", inputs="u1", outputs="y1_measured")
+    assert [len(record) for record in export.records] == [7, 4]
+    assert export.records[0].dt == 5.0
+    seen = inspect_export(tmp_path / "loop.csv")
+    assert not seen.doubts
+    with pytest.raises(MampcError, match="did you mean 'y1_measured' for 'y1'"):
+        read_export(tmp_path / "loop.csv", inputs="u1", outputs="y1")
+
+
+@pytest.mark.parametrize("path", [None, 5])
+def test_a_recorder_wants_the_name_of_a_file(path):
+    model = mampc.StateSpace([[0.9]], [[0.1]], [[1.0]], None, dt=5.0)
+    problem = mampc.TrackingProblem(model, prediction_horizon=5, control_horizon=2)
+    with pytest.raises(MampcError, match="path: expected the name of a file, received"):
+        mampc.Recorder(path, mampc.Regulator(mampc.MPC(problem)))

@@ -47,7 +47,9 @@ def require_columns(
         return
     alike = {word.casefold(): word for word in header}
     guesses = {
-        name: alike.get(name.casefold()) or next(iter(difflib.get_close_matches(name, header, n=1)), None)
+        name: alike.get(name.casefold())
+        or next(iter(difflib.get_close_matches(name, header, n=1)), None)
+        or next((word for word in header if len(name) > 1 and word.startswith(name)), None)
         for name in missing
         if name not in header
     }

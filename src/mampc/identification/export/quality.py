@@ -78,6 +78,10 @@ def _measures(sheet: Sheet, at: int, measured: Collection[str]) -> bool:
     """Whether it is named as measured, or numbers with fractions stand there, such as the quality of a product."""
     if sheet.header[at] in measured or UNIT.sub("", sheet.header[at]) in measured:
         return True
+    if (
+        sheet.header[at] == "status" and "solve_time_us" in sheet.header
+    ):  # of decisions, as loops are recorded
+        return True
     return any(is_number(cell) and not CODE.fullmatch(cell) for cell in (row[at] for row in sheet.sample))
 
 
