@@ -22,15 +22,15 @@ class Done(NamedTuple):
     stderr: str
 
 
-def call(*arguments, cwd):
+def call(*arguments, cwd, out=None):
     """What the command says and returns; in this process, since a new one would spend its time on imports."""
-    out, err, handler = io.StringIO(), io.StringIO(), signal.getsignal(signal.SIGINT)
+    out, err, handler = out or io.StringIO(), io.StringIO(), signal.getsignal(signal.SIGINT)
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err), chdir(cwd):
         patch.setattr(sys, "argv", ["mampc", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             main()
     signal.signal(signal.SIGINT, handler)
-    return Done(ended.value.code or 0, out.getvalue(), err.getvalue())
+    return Done(ended.value.code or 0, getattr(out, "getvalue", str)(), err.getvalue())
 
 
 @pytest.fixture(scope="module")
@@ -252,3 +252,14 @@ def test_an_interruption_says_what_was_kept_and_exits_with_130(tmp_path):
     assert process.wait() == 130
     assert "mampc: interrupted; what had finished is written" in said
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_output_that_knows_few_signs_gets_the_others_replaced(encoding, tmp_path):
+    names = mampc.Names(("Ventil Ω",), ("T",), units={"T": "°C"})
+    mampc.StateSpace([[0.9]], [[0.1]], [[1.0]], None, dt=1.0, names=names).save(tmp_path / "model.json")
+    out = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    done = call("show", "model.json", cwd=tmp_path, out=out)
+    assert done.returncode == 0, done.stderr
+    out.seek(0)
+    assert "Ventil ?" in out.read()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import sys
 from typing import Annotated, Any
@@ -33,6 +34,8 @@ def _interrupt(*_: Any) -> None:
 def main() -> None:
     """Run the command line; complaints go to standard error and exit with 2, an interruption with 130."""
     signal.signal(signal.SIGINT, _interrupt)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # of pipes and old consoles, which may not know every sign
+        sys.stdout.reconfigure(errors="replace")
     try:
         app()
     except (MampcError, OSError) as error:  # OSError: such as a name longer than any file's
