@@ -194,6 +194,16 @@ def test_several_records_make_one_model_whatever_their_levels(offset):
     assert miss(fitted) < miss(alone)
 
 
+@pytest.mark.parametrize("first", [5, 41, 60])
+def test_dead_times_may_be_longer_than_a_piece_of_the_record(first):
+    plant = StateSpace.from_first_order(gain=2.0, time_constant=8.0, dead_time=40.0, dt=1.0)
+    u = prbs(order=10, hold=8, samples=600, seed=0)
+    data = IOData(u, plant.response(u) + 0.1 * np.random.default_rng(0).standard_normal((600, 1)), 1.0)
+    fitted = n4sid([data[:first], data[first:]], delays=40, feedthrough=False, detrend="constant")
+    assert fitted.delays.item() == 40
+    assert gain_of(fitted) == pytest.approx(2.0, abs=0.1)
+
+
 def test_a_record_cut_in_two_is_nearly_the_whole():
     (whole,) = pieces(1, samples=1500)
     cut = n4sid([whole[:700], whole[700:]], feedthrough=False)

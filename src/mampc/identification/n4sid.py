@@ -147,7 +147,7 @@ def n4sid(
     s = block_rows_for(lengths, m, l, order, block_rows)
     records = scaled(given, centred=detrend != "none")
     settings = Settings(order, weighting, s, feedthrough, unstable)
-    dead = _given_delays(delays, l, m, min(lengths))
+    dead = _given_delays(delays, l, m, max(lengths))
     tell = progress if progress is not None else (lambda stage: None)
     values: list[Array] = []
     feedback = detrend != "none" and _under_feedback(records)
@@ -231,14 +231,14 @@ def _noise(parts: Sequence[Part], records: Scaled) -> Noise:
     return Noise(np.maximum(output, LEAST_NOISE) * records.y_spread, drift * records.y_spread)
 
 
-def _given_delays(delays: Any, l: int, m: int, shortest: int) -> Integers | None:
+def _given_delays(delays: Any, l: int, m: int, longest: int) -> Integers | None:
     if delays is None:
         return None
     given = as_array("delays", delays)
     given = np.full((l, m), float(given)) if given.ndim == 0 else as_matrix("delays", given, l, m)
-    if not (given == np.round(given)).all() or given.min() < 0 or given.max() >= shortest // 4:
+    if not (given == np.round(given)).all() or given.min() < 0 or given.max() >= longest // 4:
         raise MampcError(
-            f"delays: expected whole numbers of samples from 0 to {shortest // 4}, received {given.tolist()}"
+            f"delays: expected whole numbers of samples from 0 to {longest // 4}, received {given.tolist()}"
         )
     return given.astype(int)
 
