@@ -111,8 +111,8 @@ class LoadBank(Estimator):
         self._everything = self.filters(self._all)
         self._of_late, self._moved = moves_of_late(model), slice(model.n_states, model.n_states + l)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
-        self._of_states, self._of_known = self._everyday()
-        self._together = together(self._of_states, self._of_known)
+        self._of_states, self._of_known, self._beside = self._everyday()
+        self._together = together(self._of_states, self._of_known, self._beside)
 
     @classmethod
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
@@ -211,12 +211,13 @@ class LoadBank(Estimator):
         bank, l = _bank(last), len(y)
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
         known = np.concatenate((mixed.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain))
-        beside = len(bank.late) + len(bank.plain)
+        beside = len(self._beside)
         if not is_usable(known):
             return None
         if self._together is None:
-            each = self._of_known.dot(known[mixed.size :])
-            each[:-beside] += np.matmul(self._of_states, mixed[:, :, None]).ravel()
+            own = self._of_known.dot(known[mixed.size : mixed.size + self._of_known.shape[1]])
+            own += np.matmul(self._of_states, mixed[:, :, None]).ravel()
+            each = np.concatenate((own, self._beside.dot(known[mixed.size :])))
         else:
             each = self._together.dot(known)
         if not is_usable(each):
@@ -234,12 +235,9 @@ class LoadBank(Estimator):
         with np.errstate(over="ignore", invalid="ignore"):
             c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
             n_z, l = mixed.shape[2], y.shape[1]
-            plain_at = -bank.plain.shape[1]
-            late_at = plain_at - bank.late.shape[1]
-            of_known = known @ self._of_known.T
-            late, plain = of_known[:, late_at:plain_at], of_known[:, plain_at:]
-            each = of_known[:, :late_at].reshape(len(y), len(self.members), -1)
-            each += np.matmul(self._of_states, mixed[..., None])[..., 0]
+            late, plain = np.split(known @ self._beside.T, [bank.late.shape[1]], axis=1)
+            each = np.matmul(self._of_states, mixed[..., None])[..., 0]
+            each += (known[:, : self._of_known.shape[1]] @ self._of_known.T).reshape(each.shape)
             seen = np.einsum("sb,sbi->si", c, each[:, :, 2 * n_z : -l])
             estimate = self._weighed(*self._split(each), late, plain, c, bank, self._everything)
         return Updated(estimate, seen[:, :l], seen[:, l:])
@@ -249,11 +247,11 @@ class LoadBank(Estimator):
         n_z, l = self._A.shape[1], self.model.n_outputs
         return each[..., :n_z], each[..., n_z : 2 * n_z], each[..., -l:]
 
-    def _everyday(self) -> tuple[Array, Array]:
-        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1, late, plain) to all that `update` needs.
+    def _everyday(self) -> tuple[Array, Array, Array]:
+        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1) to all that `update` needs of each hypothesis.
 
-        For each hypothesis: z predicted, its correction, innovation, movement of the outputs, innovation made white.
-        And behind these, of what is known alone, the next `late` and `plain`.
+        That is z predicted, its correction, innovation, movement of the outputs, innovation made white.
+        And the map of (u, v_last, v, y, 1, late, plain) to the next `late` and `plain`.
         """
         model = self.model
         n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
@@ -272,7 +270,8 @@ class LoadBank(Estimator):
             of_states.append(np.vstack([A, K @ seen, seen, moved, W @ seen]))
             of_known.append(np.vstack([driven, K @ innovation, innovation, model.C @ drive, W @ innovation]))
         of_plain = self.plain.map[: n + l + m] @ np.vstack([plain, u, v_last, v, y, one])
-        return np.stack(of_states), np.vstack([*of_known, self._of_late @ np.vstack([late, u]), of_plain])
+        beside = np.vstack([self._of_late @ np.vstack([late, u]), of_plain])
+        return np.stack(of_states), np.vstack(of_known)[:, : sum(sizes[:5])].copy(), beside
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since."""

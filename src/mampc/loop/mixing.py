@@ -168,14 +168,17 @@ def _shared(places: BoolArray) -> Array:
     return places / np.maximum(count, 1.0)
 
 
-def together(blocks: Array, beside: Array) -> Array | None:
-    """Blocks (B, rows, columns) along the diagonal of one matrix, and beside them another one; None if not small."""
-    count, rows, columns = blocks.shape
-    if len(beside) * count * columns > SMALL:
+def together(blocks: Array, of_known: Array, beside: Array) -> Array | None:
+    """One matrix: blocks (B, rows, columns) along its diagonal, behind them what is known to the same rows.
+
+    Below are further rows, of what is known alone, which is more for these. None if the matrix is not small.
+    """
+    (count, rows, columns), height = blocks.shape, len(of_known) + len(beside)
+    if height * count * columns > SMALL:
         return None
-    diagonal = np.zeros((count, rows, count, columns))
-    diagonal[np.arange(count), :, np.arange(count)] = blocks
-    matrix = np.zeros((len(beside), count * columns + beside.shape[1]))
-    matrix[: count * rows, : count * columns] = diagonal.reshape(count * rows, count * columns)
-    matrix[:, count * columns :] = beside
+    matrix = np.zeros((height, count * columns + beside.shape[1]))
+    for b, block in enumerate(blocks):
+        matrix[b * rows : (b + 1) * rows, b * columns : (b + 1) * columns] = block
+    matrix[: len(of_known), count * columns : count * columns + of_known.shape[1]] = of_known
+    matrix[len(of_known) :, count * columns :] = beside
     return matrix
