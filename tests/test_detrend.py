@@ -71,6 +71,13 @@ def test_slow_and_fast_channels_keep_their_states_under_coloured_noise():
     assert (error < 0.2 * np.abs(gain).max(axis=1)).all()
 
 
+@pytest.mark.parametrize("periods", [0.6, 0.9, 2.0])
+@pytest.mark.parametrize("size", [2.0, 20.0])
+def test_a_slow_wave_does_not_change_the_gain_where_disturbances_are_made_white(size, periods):
+    record = record_with(lambda rng, N: size * np.sin(2 * np.pi * periods * np.arange(N) / N + 1.0), seed=1)
+    assert gain_of(n4sid(record, feedthrough=False, detrend="whitened")) == pytest.approx(2.0, abs=0.15)
+
+
 @pytest.mark.parametrize("seed", seeds(4, quick=1))
 def test_changes_are_not_explained_where_coloured_noise_does_not_walk(seed):
     """A plant that answers the wrong way first: from changes its gain would err by a quarter."""
