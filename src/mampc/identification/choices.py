@@ -138,8 +138,8 @@ def chosen(
         why = "Too short to hold a part out, so that nothing was compared"
         return Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
     # A drift passes for an integrator that inputs hardly move: the fewest of these win among those that predict alike.
-    # Where what is left may walk, levels say little: changes are explained. Elsewhere what predicts best wins, the
-    # simplest of what chance cannot tell apart.
+    # Where what is left may walk, levels say little: changes are explained. Elsewhere constants stand unless others are
+    # clearly better: then what predicts best wins, the simplest of what chance cannot tell apart.
     # Levels say nothing under feedback: inputs answer disturbances.
     first = scores[0].errors
 
@@ -155,6 +155,8 @@ def chosen(
     near = [k for k in near if rank(k) == min(map(rank, near))]
     if first.walk > WALK and max(scores[k].errors.root for k in near) > ROOT:
         best = min(near, key=lambda k: WALKING.index(trends[k]))
+    elif rank(0) == rank(near[0]) and first.ahead <= min(scores[k].errors.ahead for k in near) + RIVAL:
+        best = 0
     else:
         best = _within(min(AS_GOOD, CHANCE / (l * back.samples)), near, scores)[0]
     choice, score = choices[best], scores[best].errors.ahead
