@@ -50,6 +50,14 @@ def ran(model, folder, **changes):
     return run_study(study.model_copy(update=changes))
 
 
+def test_plans_count_on_later_data_but_where_the_plant_runs_away():
+    counts = {
+        name: tomllib.loads(own_study(MODELS[name], "m.json", "own")).get("estimator", {})
+        for name in ("delayed", "unstable")
+    }
+    assert counts == {"delayed": {"value_of_information": True}, "unstable": {}}
+
+
 @pytest.mark.parametrize("kind", MODELS)
 def test_it_runs_at_once_and_its_price_pays(kind, tmp_path):
     result = ran(MODELS[kind], tmp_path)

@@ -266,7 +266,7 @@ output_weight = {_list(np.diag(problem.output_weight))}  # errors count by the c
 move_weight = {_list(np.diag(problem.move_weight))}  # by what inputs do to outputs
 # Limits of the inputs are {limit_note}.
 limits = {{ u_min = {_list(limits.u_min)}, u_max = {_list(limits.u_max)} }}  # also du_max, y_min, y_max
-{_output_ranges(model)}
+{_output_ranges(model)}{_later_data(problem)}
 [reference]
 relative = true  # from the operating outputs {_some(model.y_op)}
 initial = {_list(np.zeros(model.n_outputs))}
@@ -320,6 +320,17 @@ noise = {_list(plan.noise)}
 seed = 0
 # Outputs wandered like this in the record, by loads, drifts and what the model lacks: standard deviation in a sample.
 loads = [{{ kind = "random_walk", at = "output", size = {_list(_rounded(model.noise.drift))} }}]
+"""
+
+
+def _later_data(problem: TrackingProblem) -> str:
+    """Where a search is quick, and nothing runs away from a plan that waits."""
+    grows = np.abs(problem.model.poles()).max(initial=0.0) > 1 + 1e-9
+    if problem.control_horizon * problem.model.n_inputs > TRIED or grows:
+        return ""
+    return """
+[estimator]
+value_of_information = true  # plans count on later measurements: fewer moves at the same price
 """
 
 
