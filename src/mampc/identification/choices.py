@@ -40,13 +40,7 @@ TRENDS = {
 }
 ENOUGH = 20_000  # samples in which choices are compared
 SHORT = 3  # samples of dead time that are left to the states
-WALKING = (
-    "differences",
-    "whitened",
-    "linear",
-    "constant",
-    "none",
-)  # what to take first where what is left may walk
+WALKING = ("differences", "whitened")  # what to take first where what is left may walk
 CHANCE = 4.0  # difference of log likelihoods that chance brings
 RIVALS = ("ARX", "FIR")  # for the poles of subspace models
 
@@ -153,8 +147,10 @@ def chosen(
 
     near = _within(AS_GOOD, [k for k in range(len(trends)) if k == 0 or is_fair(scores[k].errors)], scores)
     near = [k for k in near if rank(k) == min(map(rank, near))]
-    if first.walk > WALK and max(scores[k].errors.root for k in near) > ROOT:
-        best = min(near, key=lambda k: WALKING.index(trends[k]))
+    walks = first.walk > WALK and max(scores[k].errors.root for k in near) > ROOT
+    changes = [k for name in WALKING for k in near if trends[k] == name]
+    if walks and changes:
+        best = changes[0]
     elif rank(0) == rank(near[0]) and first.ahead <= min(scores[k].errors.ahead for k in near) + RIVAL:
         best = 0
     else:
