@@ -14,7 +14,8 @@ last samples did to the outputs, h, their innovations may be off: these vary by 
 times as much, and what is corrected falls by as much. Meanwhile plans count on the bank with the weight
 t = sum_b mu_b t_b, and for the rest on the plain filter that a regulator would have without a bank: that one follows
 slowly, and in one way whatever happens, so that a wrong model costs little more with a bank than without. The factor of
-the noise counts up to one here: errors of the model, which make it larger, are no reason for less caution.
+the noise counts up to one here: errors of the model, which make it larger, are no reason for less caution. Where the
+noise was guessed it counts as the least it can be, since moves may be far above the noise and within its guess.
 
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
@@ -34,7 +35,7 @@ from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
 from mampc.loop.kalman_filter import KalmanFilter
-from mampc.loop.mixing import BankEstimate, Filters, Mixing, filters_of, together
+from mampc.loop.mixing import NOISE_RANGE, BankEstimate, Filters, Mixing, filters_of, together
 from mampc.program.problem import TrackingProblem
 from mampc.systems.noise import white_noise
 from mampc.systems.state_space import StateSpace, as_discrete
@@ -85,6 +86,7 @@ class LoadBank(Estimator):
         if (sizes <= 0).any():
             raise MampcError(f"noise: expected positive numbers, received {sizes}")
         self._told = NOISE_GUESSED if as_flag("guessed", guessed) else NOISE_TOLD
+        self._doubting = NOISE_RANGE[0] if guessed else 1.0
         self.model, self.noise, self.hypotheses = model, sizes, tuple(hypotheses)
         self.loads = Loads.of(model, sizes)
         try:
@@ -357,7 +359,9 @@ class LoadBank(Estimator):
         """t of every hypothesis beside what the inputs' last moves did, shape (..., B)."""
         h = np.square(late[..., self._moved])
         moved = filters.precisions.dot(h) if h.ndim == 1 else h @ filters.precisions.T
-        trust: Array = 1 / (1 + moved / (max(filters.believed, 1) * np.minimum(scale[..., :1], 1.0)))
+        trust: Array = 1 / (
+            1 + moved / (max(filters.believed, 1) * np.minimum(scale[..., :1], self._doubting))
+        )
         return trust
 
     def _estimate(
