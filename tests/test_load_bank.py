@@ -11,7 +11,7 @@ from builders import identified_tank, random_model, tank_problem
 from load_bank_models import MODELS, bank_of
 from mampc import LoadBank, LoadKind
 from mampc.loop.disturbances import state_sizes
-from mampc.loop.doubt import LATE
+from mampc.loop.doubt import LATE, runs_away
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
 from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.riccati import predicted_covariance, seen_covariance
@@ -291,3 +291,28 @@ def test_plants_with_more_inputs_than_outputs_and_long_delays_have_a_bank(seed):
         dead_time=rng.uniform(0, 5, size), dt=1.0,
     )  # fmt: skip
     assert LoadBank(model, noise=0.05 * outputs).model is model
+
+
+@pytest.mark.parametrize("units", [1.0, 1e5])
+@pytest.mark.parametrize("seed", range(5))
+def test_integrators_beside_each_other_do_not_run_away_in_any_coordinates(seed, units):
+    """Rounding alone leads from one of them to the other."""
+    T = np.random.default_rng(seed).standard_normal((4, 4))
+    A, B = np.diag([1, 1, 0.8, 0.5]), np.array([[0.1, 0], [0, 0.3], [1, 0], [0, 1]]) * [1.0, units]
+    C = np.array([[1, 0, 0.3, 0], [0, 1, 0, 0.2]]) / [[1.0], [units]]
+    assert not runs_away(mampc.StateSpace(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T), None, 1.0))
+    A[0, 1] = 1
+    assert runs_away(mampc.StateSpace(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T), None, 1.0))
+
+
+def test_without_any_output_plans_count_on_the_bank_as_little_as_before():
+    """What the inputs' moves make doubtful does not become certain where measurements fail."""
+    model = MODELS["stable"]
+    bank = bank_of(model)
+    estimate = bank.initial(model.u_op)
+    estimate = bank.update(estimate, model.u_op + 1.0, model.y_op + 1.0, model.v_op, model.v_op).estimate
+    predicted = bank.predict(estimate, model.u_op)
+    blind = bank.corrected(predicted, np.zeros(model.n_outputs), np.zeros(model.n_outputs, dtype=bool))
+    np.testing.assert_allclose(blind.x, predicted.x, rtol=1e-9, atol=1e-12)
+    certain = (predicted.weights[:, None] * predicted.members).sum(axis=0)[: model.n_states]
+    assert np.abs(blind.x[: model.n_states] - certain).max() > 1e-3

@@ -27,11 +27,13 @@ def moves_of_late(model: StateSpace) -> Array:
 def runs_away(model: StateSpace) -> bool:
     """Whether outputs go ever faster after a pulse at some input: modes that grow, or integrators in a row."""
     pulse = model.B[:, : model.n_inputs]
-    early = np.abs(np.diff(model.step_response(model.n_states + 2)[:, :, : model.n_inputs], axis=0)).max(
-        axis=0
-    )
+    pulses = np.diff(model.step_response(model.n_states + 2)[:, :, : model.n_inputs], axis=0)
+    early = np.abs(pulses).max(axis=0)
+    # Of an input and an output in any units: what an input does not move at all is nothing but rounding.
+    rows = early.max(axis=1, keepdims=True)
+    size = rows * (early / np.where(rows > 0, rows, 1.0)).max(axis=0)
     with np.errstate(over="ignore", invalid="ignore"):
         power = np.linalg.matrix_power(model.A, LONG)
         once, twice = np.abs(model.C @ power @ pulse), np.abs(model.C @ power @ power @ pulse)
         # Twice as long after a pulse, two integrators are twice as fast. What is left of other modes may be rounding.
-        return not (twice <= 1.5 * np.maximum(once, 1e-6 * early)).all()
+        return not (twice <= 1.5 * np.maximum(once, 1e-6 * size)).all()

@@ -109,6 +109,25 @@ class Loads:
         """Units of the states that noise at the inputs gives them, shape (n,)."""
         return state_sizes(self.model.A, INPUT_NOISE * self.on_states, self.model.C / self.noise[:, None])
 
+    def at_rest(self, all_inputs: Array, y: Array | None) -> tuple[Array, Array]:
+        """States (n,) and the smallest loads (k,) with which outputs stay at y (l,) under inputs (m + d,).
+
+        No loads where y is None.
+        """
+        if y is None:
+            return self.model.steady_state(all_inputs), np.zeros(self.count)
+        model, n, sizes = self.model, self.model.n_states, self.state_sizes[:, None]
+        change = all_inputs - model.all_inputs_op
+        # (I - A) x = B change + on_states w and C x = y - y_op - D change - on_outputs w
+        of_x = np.vstack([(np.eye(n) - model.A) / sizes, model.C / self.noise[:, None]]) * sizes.T
+        of_w = np.vstack([-self.on_states / sizes, self.on_outputs / self.noise[:, None]])
+        surplus = (y - model.y_op - model.D @ change) / self.noise
+        wanted = np.concatenate([model.B @ change / sizes[:, 0], surplus])
+        left, size, _ = np.linalg.svd(of_x)
+        free = left[:, np.count_nonzero(size > 1e-9 * size.max(initial=0.0)) :].T  # whatever x is
+        w: Array = np.linalg.lstsq(free @ of_w, free @ wanted, rcond=1e-9)[0]
+        return sizes[:, 0] * np.linalg.lstsq(of_x, wanted - of_w @ w)[0], w
+
     def with_fading(self, kept: tuple[float, ...]) -> StateSpace:
         """The model with loads that fade as further states, k for every share that a sample keeps."""
         model, count, fading = self.model, len(kept), np.repeat(kept, self.count)

@@ -60,7 +60,7 @@ class LoadBank(Estimator):
         hypotheses: about the load, at least one; see `HYPOTHESES`.
 
     Raises:
-        MampcError: a continuous model, no noise, or a mode that grows and is not seen in the outputs.
+        MampcError: a continuous model, no noise, or a mode that lasts or grows and is not seen in the outputs.
     """
 
     noise: Array
@@ -91,9 +91,9 @@ class LoadBank(Estimator):
         self.loads = Loads.of(model, sizes)
         try:
             self.members = [Member(hypothesis, self.loads) for hypothesis in self.hypotheses]
+            self.plain = KalmanFilter.offset_free(model, measurement_noise=sizes)
         except MampcError as error:
             raise MampcError(f"LoadBank: {error}") from None
-        self.plain = KalmanFilter.offset_free(model, measurement_noise=sizes)
         self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
         self._planning_model = self.loads.with_fading(self._kept) if self._kept else model
         self._mixing = Mixing(np.array([h.load is LoadKind.JUMPS for h in self.hypotheses]))
@@ -148,10 +148,10 @@ class LoadBank(Estimator):
 
     def shifts(self, samples: int) -> Array:
         """See `Estimator.shifts`."""
-        everything, shifts = self._all, []
-        for b, member in enumerate(self.members):
-            root = np.linalg.cholesky(member.innovation_covariance(everything))
-            shifts.append(self.to_plan(b) @ member.gain(everything) @ root)
+        shifts = []
+        for plan, member in zip(self._plans, self.members, strict=True):
+            root = np.linalg.cholesky(member.innovation_covariance(self._all))
+            shifts.append(plan @ member.gain(self._all) @ root)
         return np.tile(np.stack(shifts)[:, None], (1, samples, 1, 1))
 
     def weights_of(self, estimate: Estimate) -> Array:
@@ -184,22 +184,9 @@ class LoadBank(Estimator):
         """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
         point; with measurements y (l,) the loads explain them, as small as they can.
         """
-        model, loads = self.model, self.loads
-        n, k = model.n_states, loads.count
+        model, k = self.model, self.loads.count
         all_inputs = np.concatenate([u, model.v_op if v is None else v])
-        change, w = all_inputs - model.all_inputs_op, np.zeros(k)
-        x = model.steady_state(all_inputs)
-        if y is not None:
-            # (I - A) x = B change + on_states w and C x = y - y_op - D change - on_outputs w
-            sizes = loads.state_sizes[:, None]
-            of_x = np.vstack([(np.eye(n) - model.A) / sizes, model.C / self.noise[:, None]]) * sizes.T
-            of_w = np.vstack([-loads.on_states / sizes, loads.on_outputs / self.noise[:, None]])
-            surplus = (as_vector("y", y, model.n_outputs) - model.y_op - model.D @ change) / self.noise
-            wanted = np.concatenate([model.B @ change / sizes[:, 0], surplus])
-            left, size, _ = np.linalg.svd(of_x)
-            free = left[:, np.count_nonzero(size > 1e-9 * size.max(initial=0.0)) :].T  # whatever x is
-            w = np.linalg.lstsq(free @ of_w, free @ wanted, rcond=1e-9)[0]
-            x = sizes[:, 0] * np.linalg.lstsq(of_x, wanted - of_w @ w)[0]
+        x, w = self.loads.at_rest(all_inputs, None if y is None else as_vector("y", y, model.n_outputs))
         usual = self._mixing.lasts / self._mixing.lasts.sum()
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
         late = np.concatenate([np.zeros(len(self._of_late) - len(u)), u])
@@ -304,12 +291,8 @@ class LoadBank(Estimator):
         correction = np.matmul(filters.gains, each[:, :, None])[:, :, 0]
         white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
         plain, model = self._plain_of(bank), self.model
-        of_plain = (
-            model.C @ plain.x
-            + model.D[:, : model.n_inputs] @ plain.input_disturbance
-            + plain.output_disturbance
-        )
-        off = np.where(believed, innovation + bank.weights @ seen - of_plain, 0.0)
+        seen_beside = bank.weights @ seen + self.plain.innovation(plain, model.u_op, model.y_op)
+        off = np.where(believed, innovation + seen_beside, 0.0)
         corrected = _flat(self.plain.corrected(plain, off, believed))
         return self._weighed(
             bank.members, correction, white, bank.late, corrected, bank.weights, bank, filters
@@ -343,7 +326,8 @@ class LoadBank(Estimator):
             c: how likely each hypothesis was before, shape (..., B).
         """
         surprise = np.square(white).dot(self._per_output)
-        trust = self._trust(late, bank.scale, filters)
+        # Without any output the inputs' moves are as doubtful as they were with all.
+        trust = self._trust(late, bank.scale, filters if filters.believed else self._everything)
         surprise *= trust
         log_scale = filters.log_scale + 0.5 * filters.believed * np.log(trust)
         after = self._mixing.one if late.ndim == 1 else self._mixing.many
@@ -359,9 +343,8 @@ class LoadBank(Estimator):
         """t of every hypothesis beside what the inputs' last moves did, shape (..., B)."""
         h = np.square(late[..., self._moved])
         moved = filters.precisions.dot(h) if h.ndim == 1 else h @ filters.precisions.T
-        trust: Array = 1 / (
-            1 + moved / (max(filters.believed, 1) * np.minimum(scale[..., :1], self._doubting))
-        )
+        noise = filters.believed * np.minimum(scale[..., :1], self._doubting)
+        trust: Array = 1 / (1 + moved / noise)
         return trust
 
     def _estimate(
