@@ -428,3 +428,25 @@ def test_the_norm_of_self_triggered_control_falls_by_its_rate_under_the_lq_law_w
     for _ in range(30):
         before, z = np.abs(law.P @ z).max(axis=0), (law.A - law.B @ law.K) @ z
         assert (np.abs(law.P @ z).max(axis=0) <= law.rho * before * (1 + 1e-6)).all()
+
+
+@pytest.mark.parametrize("units", [1.0, 1e4])
+@pytest.mark.parametrize("penalty", [rivals.GroupL2, rivals.CLOT], ids=["group_l2", "clot"])
+def test_where_a_penalty_with_norms_holds_inputs_still_no_move_is_left(penalty, units):
+    """A conic solver comes near zero only; what it leaves there would count as moves."""
+    model = mampc.StateSpace(
+        [[0.9, 0.1], [0, 0.7]], np.array([[1, 0.2], [0.3, 1]]) / units, np.eye(2), None, 1.0
+    )
+    limits = mampc.Limits(u_min=-units, u_max=units, du_max=0.2 * units)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=8, control_horizon=3, move_weight=0.1 / units**2, limits=limits
+    )
+    controller = rivals.Penalised(problem, penalty=penalty(weight=1.0, size=units))
+    rng = np.random.default_rng(0)
+    still = 0
+    for _ in range(30):
+        decision = controller.step(controller.initial_state(), np.zeros(2), 0.02 * rng.standard_normal(2))
+        largest = np.abs(decision.changes).max(axis=1)
+        assert (largest[decision.moves.any(axis=1)] > 1e-5 * units).all()
+        still += not decision.moves.any()
+    assert 5 < still < 30

@@ -33,6 +33,8 @@ from mampc.rivals.penalties import Norms, Separable
 
 CURVATURE = 1e-7  # of t, relative to the moves' in units of size: daqp wants a strictly convex program
 ZERO = 1e-5  # of the largest |z| / size: below it an entry is none
+NEARLY = (1e-1, 1e-2, 1e-3, 1e-4)  # of the same, from a conic solver: below it an entry may be none
+ROUNDED = 1e-9  # of the moves without penalty: how far inputs may be beyond bounds for rounding
 ON = ("moves", "inputs")
 TERMINALS = (None, "riccati")
 
@@ -102,7 +104,7 @@ class Penalised(Controller):
             plan = self._majorised(self.penalty, sample, z0, f)
         else:
             plan = self._of_norms(sample, z0, f)
-        return plan if plan.moves is None else plan._replace(moves=self._without_nothing(plan.moves, z0))
+        return plan
 
     def _of_norms(self, sample: Sample, z0: Array, f: Array) -> Plan:
         """The optimum for a sum of norms; f is linear in the moves and beside the tracking cost, as below."""
@@ -113,7 +115,25 @@ class Penalised(Controller):
         solution = self._conic.solve(linear, sample.lower, sample.upper, constants)
         if solution.z is None:
             return Plan(None, HELD_BY[solution.status], solution.iterations)
-        return Plan(solution.z[v:], Status.SETTLED, solution.iterations)
+        d = solution.z[v:]
+        value, unit = self._value(sample, d, z0, f), self._sizes(sample.moves, z0).max()
+        room = self._excess(sample, d)
+        for share in NEARLY:  # the central path comes near zero only: zero is better where it is the optimum
+            sparse = self._without_nothing(d, z0, share, unit)
+            if self._value(sample, sparse, z0, f) <= value and (self._excess(sample, sparse) <= room).all():
+                return Plan(sparse, Status.SETTLED, solution.iterations)
+        return Plan(self._without_nothing(d, z0), Status.SETTLED, solution.iterations)
+
+    def _excess(self, sample: Sample, d: Array) -> Array:
+        """By how much rows of inputs are beyond their bounds, at least what rounding may add, shape (rows,)."""
+        program, v = self.condensed.program, self.condensed.n_violations
+        of_inputs = ~program.A[:, :v].any(axis=1)
+        rows, low, high = (
+            one[of_inputs]
+            for one in (program.A, sample.lower[program.n_simple :], sample.upper[program.n_simple :])
+        )
+        at, size = rows[:, v:] @ d, np.abs(rows[:, v:]) @ np.abs(sample.moves)
+        return np.maximum(np.maximum(at - high, low - at), ROUNDED * size)
 
     def _majorised(self, penalty: Separable, sample: Sample, z0: Array, f: Array) -> Plan:
         """Majorise and minimise, from the plan without penalty on."""
@@ -138,7 +158,7 @@ class Penalised(Controller):
                 status = Status.SETTLED
                 break
             last = value
-        return Plan(d, status, rounds)
+        return Plan(self._without_nothing(d, z0), status, rounds)
 
     def _sizes(self, d: Array, z0: Array) -> Array:
         """a of the penalty, shape (nc, m)."""
@@ -167,16 +187,16 @@ class Penalised(Controller):
             self._kept = key, DaqpSolver(program, tolerance=1e-9 * np.sqrt(CURVATURE))
         return self._kept[1]
 
-    def _without_nothing(self, d: Array, z0: Array) -> Array:
-        """The moves with entries of z that are nothing beside the largest exactly zero."""
+    def _without_nothing(self, d: Array, z0: Array, share: float = ZERO, unit: float = 0.0) -> Array:
+        """The moves with entries of z that are nothing beside the largest, or beside a unit, exactly zero."""
         z = self._z @ d + z0
-        largest = max(np.abs(z).max(), np.abs(z0).max())
-        z = np.where(np.abs(z) <= ZERO * largest, 0.0, z)
+        largest = max(np.abs(z).max(), np.abs(z0).max(), unit)
+        z = np.where(np.abs(z) <= share * largest, 0.0, z)
         if not self._on_inputs:
             return np.where(z == 0.0, 0.0, d)
         moves: Array = np.linalg.solve(self._z, z - z0)
         moved = np.abs(moves / self._size)
-        moves[moved <= ZERO * moved.max()] = 0.0
+        moves[moved <= share * moved.max()] = 0.0
         return moves
 
 
