@@ -11,6 +11,7 @@ from builders import cost_of, random_model, same_decision, tank_problem
 from mampc import MampcError, MoveRules, Status
 from mampc.methods.heuristic import MOST_PROGRAMS
 from mampc.moves.admissible import AdmissiblePatterns
+from mampc.moves.pattern_solver import PatternSolver
 from mampc.program.restriction import Restriction
 from referees import charge, keeps_rules
 from seeds import examples
@@ -265,3 +266,18 @@ def test_a_name_and_an_object_with_the_same_settings_decide_alike(name):
     method = mampc.METHODS[name](**SETTINGS.get(name, {}))
     given = decide(mampc.MAMPC(problem, RULES["budget"], method=method), past, x, reference)
     assert same_decision(named, given)
+
+
+def test_greedy_says_how_many_patterns_it_tried(monkeypatch):
+    tried, offer = [], PatternSolver.offer
+    monkeypatch.setattr(PatternSolver, "offer", lambda *of, **how: tried.append(1) or offer(*of, **how))
+    for seed in range(8):
+        model = random_model(seed)
+        limits = mampc.Limits(u_min=model.u_op - 1, u_max=model.u_op + 1, du_max=[np.inf, 0.3][seed % 2])
+        problem = mampc.TrackingProblem(
+            model, prediction_horizon=8, control_horizon=4, move_weight=0.01, limits=limits
+        )
+        controller = mampc.MAMPC(problem, MoveRules(max_moves=2, sparsity_horizon=2), method="greedy")
+        tried.clear()
+        decision = controller.step(controller.initial_state(), np.zeros(3), model.y_op + 1.0)
+        assert decision.iterations == len(tried)

@@ -125,22 +125,21 @@ class LocalSearch:
         Returns how many there were.
         """
         least_gain = LEAST_GAIN * sample.constant
-        pattern, best = self.forward(f, past), None
-        for number in range(ROUNDS):
+        pattern, best, tried = self.forward(f, past), None, 0
+        for _ in range(ROUNDS):
             last, pattern = pattern, self.exchange(f, past, pattern, least_gain)
-            if number and (pattern == last).all():
+            if tried and (pattern == last).all():
                 break
+            tried += 1
             solved = yield pattern
             if solved.moves is not None:
                 best = pattern, solved
             if solved.multipliers is None or not solved.multipliers.any():
                 break
             f, _ = self.condensed.relaxed_limits(sample, solved.multipliers)
-        else:
-            number = ROUNDS
-        if best is None or best[1].multipliers is None or not best[1].multipliers.any():
-            return number + 1
-        return number + 1 + (yield from self._one_by_one(sample, past, *best, least_gain))
+        if best is not None and best[1].multipliers is not None and best[1].multipliers.any():
+            tried += yield from self._one_by_one(sample, past, *best, least_gain)
+        return tried
 
     def _one_by_one(
         self, sample: Sample, past: Allowance, pattern: BoolArray, solved: OnPattern, least_gain: float
