@@ -149,3 +149,14 @@ def test_of_many_short_records_the_longest_are_looked_at():
     assert [len(u) for u in few.u] == list(range(144 - len(few.u) + 6, 150))
     assert len(few.y_mean) == len(few.u)
     assert 1000 <= few.samples < 1150
+
+
+def test_an_input_that_stays_in_one_record_hides_no_movement_of_another_input():
+    rng = np.random.default_rng(0)
+    late, early = np.zeros((40_000, 2)), np.zeros((40_000, 2))
+    late[30_000:35_000, 0] = np.sign(rng.standard_normal(5000))
+    early[:, 1] = np.sign(rng.standard_normal(40_000))
+    records = scaled([IOData(u, rng.standard_normal((40_000, 1)), 1.0) for u in (late, early)])
+    where = telling(records)
+    assert where[0].start <= 30_000
+    assert where[0].stop >= 35_000

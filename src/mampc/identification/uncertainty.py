@@ -29,14 +29,15 @@ PAST, LEAST = 20, 8  # values that make a disturbance white, and samples of a re
 
 
 def telling(records: Scaled) -> list[slice]:
-    """The stretch of each record, `PLENTY` samples of all, in which inputs moved most, all of them."""
+    """The stretch of each record, `PLENTY` samples of all, in which inputs moved most, all that move in it."""
     found = []
     for u, length in zip(records.u, records.lengths(PLENTY), strict=True):
         start = 0
         if 0 < length < len(u):
             moved = np.cumsum(np.diff(u, axis=0, prepend=u[:1]) ** 2, axis=0)
             starts = np.arange(0, len(u) - length + 1, max(1, length // 4))
-            inside = (moved[starts + length - 1] - moved[starts]) / np.maximum(moved[-1], 1e-300)
+            moved = moved[:, moved[-1] > 0] / moved[-1, moved[-1] > 0]
+            inside = moved[starts + length - 1] - moved[starts]
             start = int(starts[np.argmax(inside.prod(axis=1))])
         found.append(slice(start, start + length))
     return found
