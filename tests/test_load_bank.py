@@ -316,3 +316,17 @@ def test_without_any_output_plans_count_on_the_bank_as_little_as_before():
     np.testing.assert_allclose(blind.x, predicted.x, rtol=1e-9, atol=1e-12)
     certain = (predicted.weights[:, None] * predicted.members).sum(axis=0)[: model.n_states]
     assert np.abs(blind.x[: model.n_states] - certain).max() > 1e-3
+
+
+def test_a_vessel_whose_level_nobody_measures_stands_beside_a_loop_with_a_bank():
+    model = mampc.StateSpace([[0.8, 0], [1, 1]], [[0.2], [0]], [[1, 0]], None, 1.0)
+    seen = mampc.StateSpace([[0.8]], [[0.2]], [[1]], None, 1.0)
+    bank, other = bank_of(model), bank_of(seen)
+    one, two = bank.initial(model.u_op), other.initial(seen.u_op)
+    for k in range(200):
+        u, y = np.array([np.sin(k)]), np.array([np.cos(0.1 * k)])
+        one, two = (
+            b.update(e, u, y, np.zeros(0), np.zeros(0)).estimate for b, e in ((bank, one), (other, two))
+        )
+    assert one.x[0] == pytest.approx(two.x[0], rel=1e-3, abs=1e-3)
+    np.testing.assert_allclose(one.weights, two.weights, rtol=1e-2, atol=1e-3)

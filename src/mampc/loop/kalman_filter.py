@@ -25,7 +25,7 @@ from mampc.loop.disturbances import (
 )
 from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.systems.noise import white_noise
-from mampc.systems.riccati import predicted_covariance
+from mampc.systems.riccati import predicted_covariance, seen_covariance
 from mampc.systems.state_space import StateSpace, as_discrete
 
 _ONE = np.ones(1)
@@ -67,6 +67,7 @@ class KalmanFilter(Estimator):
         measurement_noise: Any = None,
         drift: Any = None,
         input_noise: Any = None,
+        unseen: bool = False,
     ) -> KalmanFilter:
         """A filter with as many integrating disturbances as outputs, where the inputs can make up for them.
 
@@ -87,6 +88,8 @@ class KalmanFilter(Estimator):
                 the measurement noise.
             input_noise: standard deviation of noise at the inputs, scalar or (m,), in input units; the
                 default is what moves the outputs within `REACH` samples by the measurement noise.
+            unseen: whether the model may have lasting modes that no output shows; what is estimated of these says
+                nothing.
 
         Raises:
             MampcError: a continuous model, or one whose disturbances cannot be told apart from its
@@ -113,10 +116,13 @@ class KalmanFilter(Estimator):
         Q[n:, n:] = np.diag(directions.sizes(wander / noise) ** 2)
         R = np.diag(noise**2)
         of_all = np.concatenate([sizes, np.ones(len(A) - n)])
-        _require_detectable(A * of_all / of_all[:, None], C * of_all / noise[:, None], disturbance)
         units = np.outer(of_all, of_all)
+        scaled = A * of_all / of_all[:, None], C * of_all, Q / units, R
+        covariance = seen_covariance if unseen else predicted_covariance
+        if not unseen:
+            _require_detectable(scaled[0], C * of_all / noise[:, None], disturbance)
         try:
-            P = units * predicted_covariance(A * of_all / of_all[:, None], C * of_all, Q / units, R)
+            P = units * covariance(*scaled)
         except MampcError as error:
             raise MampcError(f"offset_free: {error}") from None
         return cls(model, directions, P, R)

@@ -60,7 +60,7 @@ class LoadBank(Estimator):
         hypotheses: about the load, at least one; see `HYPOTHESES`.
 
     Raises:
-        MampcError: a continuous model, no noise, or a mode that lasts or grows and is not seen in the outputs.
+        MampcError: a continuous model, no noise, or a mode that grows and is not seen in the outputs.
     """
 
     noise: Array
@@ -91,7 +91,7 @@ class LoadBank(Estimator):
         self.loads = Loads.of(model, sizes)
         try:
             self.members = [Member(hypothesis, self.loads) for hypothesis in self.hypotheses]
-            self.plain = KalmanFilter.offset_free(model, measurement_noise=sizes)
+            self.plain = KalmanFilter.offset_free(model, measurement_noise=sizes, unseen=True)
         except MampcError as error:
             raise MampcError(f"LoadBank: {error}") from None
         self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
