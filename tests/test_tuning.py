@@ -446,3 +446,15 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_search(tmp_path, mon
     )
     assert result.exit_code != 0
     assert "--out: expected a folder that can be written" in str(result.exception) + result.output
+
+
+def test_the_usual_horizon_of_a_level_sees_as_much_behind_any_dead_time():
+    def of(dead_time):
+        model = mampc.StateSpace.from_first_order(gain=1.0, time_constant=np.inf, dead_time=dead_time, dt=1.0)
+        return usual_problem(model, mampc.Limits(u_min=-1.0, u_max=1.0), 1.0)
+
+    at_once = of(0.0)
+    for dead_time in (5.0, 12.0, 60.0):
+        problem = of(dead_time)
+        assert problem.prediction_horizon == at_once.prediction_horizon + dead_time
+        np.testing.assert_allclose(problem.move_weight, at_once.move_weight, rtol=1e-9)

@@ -15,7 +15,7 @@ from mampc.systems.state_space import StateSpace
 
 SETTLED = 0.05  # share of a step response's largest value that may be missing where it has settled
 LONGEST_SETTLING = 500  # samples that are looked at
-HORIZONS = (10, 60)  # fewest and most samples of a prediction horizon; dead times come on top of the most
+HORIZONS = (10, 60)  # fewest and most samples of a prediction horizon; dead times come on top of both
 BEGUN = 1e-3  # share of a step response's largest value up to which it is dead time
 LASTS = 1e-6  # distance from the unit circle of poles of levels
 FREE_MOVES = 5  # control horizon
@@ -35,7 +35,7 @@ def usual_problem(model: StateSpace, limits: Limits, output_weight: Any) -> Trac
     shortest, longest = HORIZONS
     dead, most = dead_samples(model), MOST_PREDICTIONS // model.n_outputs
     longest, furthest = (min(samples + dead, most) for samples in (longest, 2 * longest))
-    n_p = int(np.clip(settling(model), min(shortest, longest), longest))
+    n_p = int(np.clip(settling(model), min(shortest + dead, longest), longest))
     n_c = min(FREE_MOVES, n_p)
     settings = {"prediction_horizon": n_p, "control_horizon": n_c, "output_weight": output_weight}
     problem = TrackingProblem(model, **settings, move_weight=1.0, limits=limits)
