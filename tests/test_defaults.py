@@ -59,10 +59,36 @@ def test_a_regulator_says_what_it_estimates_with():
     assert "value_of_information" in repr(mampc.Regulator(sparse, value_of_information=True))
 
 
+def counts(controller, **settings):
+    return mampc.Regulator(controller, **settings).value_of_information
+
+
+def test_plans_count_on_later_data_where_few_moves_have_a_price_and_no_offset_is_promised():
+    model = identified_tank()
+    problem = tank_problem(model, control_horizon=3)
+    assert counts(mampc.MAMPC(problem, PRICE))
+    assert counts(mampc.ControllerBank({"a": mampc.MAMPC(problem, PRICE), "b": mampc.MAMPC(problem, PRICE)}))
+    assert not counts(mampc.MAMPC(problem, PRICE), value_of_information=False)
+    assert not counts(mampc.MAMPC(problem, PRICE), estimator=KalmanFilter.offset_free(model))
+    for rules in (MoveRules(max_moves=2, sparsity_horizon=3), MoveRules(price=1.0, min_size=1.0)):
+        assert not counts(mampc.MAMPC(problem, rules))
+    assert not counts(mampc.MAMPC(problem, PRICE, method="greedy"))
+    promised = replace(problem, tail_horizon=2000.0)
+    assert np.isfinite(mampc.largest_offset(promised, PRICE)).all()
+    for other in (promised, replace(problem, zone_above=1.0), replace(problem, control_horizon=7)):
+        assert not counts(mampc.MAMPC(other, PRICE))
+    runs_away = mampc.StateSpace([[1.05]], [[1.0]], [[1.0]], None, 1.0)
+    limits = mampc.Limits(u_min=-9.0, u_max=9.0)
+    unstable = mampc.TrackingProblem(runs_away, prediction_horizon=9, control_horizon=3, limits=limits)
+    assert isinstance(estimator(mampc.MAMPC(unstable, PRICE)), LoadBank)
+    assert not counts(mampc.MAMPC(unstable, PRICE))
+
+
 @pytest.mark.parametrize(
     ("table", "of_mpc", "of_price"),
     [
         ("", KalmanFilter, LoadBank),
+        ("value_of_information = false", KalmanFilter, LoadBank),
         ("measurement_noise = 0.2", KalmanFilter, LoadBank),
         ('kind = "load_bank"', LoadBank, LoadBank),
         ('kind = "kalman_filter"', KalmanFilter, KalmanFilter),
@@ -78,7 +104,9 @@ def test_a_study_has_the_same_defaults(table, of_mpc, of_price):
     made = {one.name: regulator_of(study, model, one) for one in study.controllers}
     for name, kind in (("MPC", of_mpc), ("MAMPC ns=3", of_mpc), ("exact price", of_price)):
         assert isinstance(made[name].estimator, kind)
-        assert made[name].value_of_information == ("value" in table and name == "exact price")
+        assert made[name].value_of_information == (
+            name == "exact price" and of_price is LoadBank and "false" not in table
+        )
     if "noise" in table:
         np.testing.assert_array_equal(made["exact price"].estimator.noise, [0.2, 0.2])
 

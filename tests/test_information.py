@@ -160,7 +160,10 @@ def test_every_method_keeps_to_the_same_objective():
 def test_it_is_off_by_one_argument_and_refused_where_it_has_no_meaning():
     problem = problem_of(tank_model())
     bank, rules = mampc.LoadBank(problem.model, noise=0.1), mampc.MoveRules(price=1.0)
-    assert mampc.Regulator(mampc.MAMPC(problem, rules), bank)._planner.information is None
+    assert (
+        mampc.Regulator(mampc.MAMPC(problem, rules), bank, value_of_information=False)._planner.information
+        is None
+    )
     with pytest.raises(
         mampc.MampcError,
         match="value_of_information: expected a controller MAMPC, or a bank of them, received MPC",
@@ -236,7 +239,7 @@ def test_prices_follow_the_noise_only_where_all_patterns_are_listed():
     bank = mampc.LoadBank(problem.model, noise=0.1)
     sparse = mampc.MAMPC(problem, mampc.MoveRules(price=1.0))
     with pytest.raises(mampc.MampcError, match="value_of_information=True beside it"):
-        mampc.Regulator(sparse, bank, price_follows_noise=True)
+        mampc.Regulator(sparse, bank, value_of_information=False, price_follows_noise=True)
     greedy = mampc.MAMPC(problem, mampc.MoveRules(price=1.0), method="greedy")
     with pytest.raises(mampc.MampcError, match="price_follows_noise: expected method='exact'"):
         mampc.Regulator(greedy, bank, value_of_information=True, price_follows_noise=True)

@@ -1,21 +1,28 @@
 """What a regulator estimates with unless it is told.
 
 Where moves cost something or are few, each one made for noise, or late for a load, counts: there a `LoadBank` makes the
-better use of them. Plain MPC moves at every sample anyway, a rule around it is what one would use instead, and the
-paper's method stays as it is published: these have a `KalmanFilter`.
+better use of them, and plans count on what later measurements will tell. Plain MPC moves at every sample anyway, a rule
+around it is what one would use instead, and the paper's method stays as it is published: these have a `KalmanFilter`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.mampc import MAMPC
+from mampc.controllers.offset import largest_offset
+from mampc.loop.doubt import runs_away
 from mampc.loop.estimator import Estimator
 from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.load_bank import LoadBank
 from mampc.methods.alternating import Alternating
+from mampc.methods.exact.search import Exact
+
+FEW = 12  # planned moves, up to which all patterns are listed in a moment
 
 
 def has_scarce_moves(controller: Controller) -> bool:
@@ -42,3 +49,32 @@ def default_estimator(controller: Controller, noise: Any = None) -> Estimator:
         except MampcError:
             pass
     return KalmanFilter.offset_free(controller.problem.model, measurement_noise=noise)
+
+
+def counts_on_later_data(controller: Controller, estimator: Estimator) -> bool:
+    """Whether plans count on later measurements unless told otherwise.
+
+    They do with a `LoadBank` where moves have a price and what these will tell is known: for the exact search of a few
+    moves of any size, about set points. A plant that runs away cannot wait, and where the tail is long enough for
+    `largest_offset` to promise something, that promise is kept, which plans that wait would not.
+    """
+    priced = [one for one in controller.each if type(one) is MAMPC and not one.is_plain]
+    return (
+        isinstance(estimator, LoadBank)
+        and bool(priced)
+        and all(_knows_what_they_tell(one) for one in priced)
+        and not runs_away(controller.problem.model)
+    )
+
+
+def _knows_what_they_tell(controller: MAMPC) -> bool:
+    rules = controller.rules
+    return bool(
+        isinstance(controller.method, Exact)
+        and controller.condensed.n_moves <= FEW
+        and np.min(rules.price) > 0
+        and not np.any(rules.min_size)
+        and rules.levels is None
+        and not controller.problem.zoned.any()
+        and not np.isfinite(largest_offset(controller.problem, controller.rules)).any()
+    )

@@ -22,7 +22,7 @@ from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.controllers.mampc import MAMPC
 from mampc.loop.actuators import LATEST, Actuators
-from mampc.loop.defaults import default_estimator
+from mampc.loop.defaults import counts_on_later_data, default_estimator
 from mampc.loop.estimator import Estimate, Estimator
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.sensors import Judged, SensorChecks, SensorState
@@ -47,7 +47,8 @@ class Regulator:
             all is believed; from then on they are held until one is. 0 holds at once.
         value_of_information: plan with what later measurements will tell (see docs/how-it-decides.md): needs `MAMPC`
             and an estimator that knows the noise in output units, a `LoadBank`. Objectives of decisions hold it
-            then, and what `largest_offset` promises does not.
+            then, and what `largest_offset` promises does not. Default where moves have a price, these are few, and
+            nothing runs away (`loop.defaults`); not where `largest_offset` is finite, which plans that wait may exceed.
         price_follows_noise: the price is for the noise that the estimator was told, and is scaled by the variance of
             what it finds; for noise that was guessed. Needs `value_of_information` and an exact search by a table.
         applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
@@ -71,7 +72,7 @@ class Regulator:
         *,
         sensors: SensorChecks | None = None,
         max_blind_steps: int = 0,
-        value_of_information: bool = False,
+        value_of_information: bool | None = None,
         price_follows_noise: bool = False,
         applied_tolerance: Any = None,
         reference_filter: ReferenceFilter | None = None,
@@ -112,7 +113,9 @@ class Regulator:
         self._planner = controller
         if self.estimator.planning_model is not self.estimator.model:
             self._planner = controller.with_model(self.estimator.planning_model)
-        self.value_of_information = as_flag("value_of_information", value_of_information)
+        self.value_of_information = counts_on_later_data(controller, self.estimator)
+        if value_of_information is not None:
+            self.value_of_information = as_flag("value_of_information", value_of_information)
         self.price_follows_noise = as_flag("price_follows_noise", price_follows_noise)
         if self.price_follows_noise and not self.value_of_information:
             raise MampcError("price_follows_noise: expected value_of_information=True beside it")

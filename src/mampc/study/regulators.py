@@ -40,13 +40,14 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
         table = next(other for other in tables if other.name == table.name)
     controller = _controller(problem, table, tables)
     estimator = _estimator(study.estimator, controller)
-    counts = study.estimator.value_of_information and isinstance(estimator, LoadBank)
-    counts = counts and any(type(one) is MAMPC for one in controller.each)
+    counts = study.estimator.value_of_information
+    if counts:
+        counts = isinstance(estimator, LoadBank) and any(type(one) is MAMPC for one in controller.each)
     smooth = None if table.reference_filter is None else table.reference_filter.made()
     with said_at(f"controllers, {table.name!r}: "):
         return Regulator(
             controller, estimator, reference_filter=smooth, valves=valves, value_of_information=counts,
-            price_follows_noise=counts and study.estimator.price_follows_noise, **_sensors(study),
+            price_follows_noise=bool(counts) and study.estimator.price_follows_noise, **_sensors(study),
         )  # fmt: skip
 
 

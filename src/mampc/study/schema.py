@@ -244,7 +244,7 @@ class ControllerTable(Table):
 
 class EstimatorTable(Table):
     kind: Literal["usual", "kalman_filter", "load_bank"] = "usual"  # what each controller has by default
-    value_of_information: bool = False
+    value_of_information: bool | None = None  # usual where moves have a price and are few
     price_follows_noise: bool = False
     disturbance: Literal["auto", "output", "input"] = "auto"
     measurement_noise: Values | None = None
