@@ -90,9 +90,10 @@ def test_as_few_states_as_the_channels_need():
     assert states(gain=np.ones((2, 2)), time_constant=0.0) == 0
 
 
-def test_levels_are_at_exactly_one_and_loops_close_on_them():
+@pytest.mark.parametrize("first", [0.0, 30.0])
+def test_levels_are_at_exactly_one_and_loops_close_on_them(first):
     model = StateSpace.from_first_order(
-        gain=[[0.02, -0.02]], time_constant=np.inf, dead_time=[[0.0, 30.0]], dt=10.0, u_op=50.0, y_op=5.0,
+        gain=[[0.02, -0.02]], time_constant=np.inf, dead_time=[[first, 70.0]], dt=10.0, u_op=50.0, y_op=5.0,
         names=mampc.Names(inputs=("feed",), outputs=("level",), disturbances=("draw",)),
     )  # fmt: skip
     assert np.sum(np.abs(model.poles() - 1.0) < 1e-12) == 1

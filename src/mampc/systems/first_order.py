@@ -6,8 +6,8 @@ sampled exactly for inputs held constant between samples. A dead time of q sampl
 
     x+ = a x + b(f) u_{k-q} + (b(0) - b(f)) u_{k-q-1},     a = exp(-dt / tau),  b(f) = K (1 - exp(-(dt - f) / tau))
 
-and past inputs are states, in one chain for all channels of an input (or, where that takes fewer states, past outputs
-for all channels of an output).
+and past inputs are states, in one chain for all channels of an input (or, where that takes fewer integrators or, of as
+many, fewer states, past outputs for all channels of an output): two integrators of one output could not be told apart.
 
 Source: Åström and Wittenmark, Computer-Controlled Systems (1997), section 2.3.
 """
@@ -41,13 +41,14 @@ def first_order(
     require_finite("dead_time", theta)
     # A dead time within rounding of whole samples is whole.
     samples = np.where(np.abs(theta / dt - np.round(theta / dt)) < 1e-9, np.round(theta / dt), theta / dt)
-    states = min(_states(tau, samples), _states(tau.T, samples.T))
+    turned = _size(tau.T, samples.T) < _size(tau, samples)
+    _, states = _size(tau.T, samples.T) if turned else _size(tau, samples)
     if states > MOST_STATES:
         raise MampcError(
             f"from_first_order: expected a model of at most {MOST_STATES} states, received dead times that take "
             f"{states:g}; a longer dt takes fewer"
         )
-    if _states(tau.T, samples.T) < _states(tau, samples):
+    if turned:
         A, B, C, D = _realised(K.T, tau.T, samples.T, dt)
         return A.T, C.T, B.T, D.T
     return _realised(K, tau, samples, dt)
@@ -74,10 +75,10 @@ def _broadcast(*given: Any) -> tuple[Array, ...]:
     return tuple(np.broadcast_to(array, shape).copy() for array in arrays)
 
 
-def _states(tau: Array, samples: Array) -> float:
-    """How many states `_realised` takes."""
+def _size(tau: Array, samples: Array) -> tuple[int, float]:
+    """How many integrators and states `_realised` takes."""
     lags = sum(len({value for value in row if value > 0}) for row in tau.tolist())
-    return float(_chains(tau, samples).sum()) + lags
+    return int(np.isinf(tau).any(axis=1).sum()), float(_chains(tau, samples).sum()) + lags
 
 
 def _chains(tau: Array, samples: Array) -> Array:
