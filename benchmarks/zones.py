@@ -81,7 +81,7 @@ def outcome(of: Case, name: str, price: float, width: float, pull: float, kalman
     )  # fmt: skip
     rules = mampc.MoveRules(price=100 * price * of.sigma**2)
     estimator = mampc.KalmanFilter.offset_free(of.model) if kalman else None
-    regulator = mampc.Regulator(mampc.MAMPC(problem, rules), estimator)
+    regulator = mampc.Regulator(mampc.MAMPC(problem, rules), estimator, value_of_information=False)
     batch = mampc.simulate_batch(
         of.plant, regulator, of.model.y_op, steps=STEPS, seeds=range(of.seeds),
         noise=of.sigma, loads=[of.load], progress=False,
