@@ -10,6 +10,7 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.loop.run import Run
 from mampc.study import Study, StudyResult
+from mampc.study.regulators import regulator_of
 from mampc.study.wear import Ratings, ratings_of
 
 
@@ -17,6 +18,9 @@ def summarise(result: StudyResult) -> dict[str, Any]:
     """The content of summary.json: plain numbers, lists and text, no number that JSON cannot hold."""
     study, model, identified = result.study, result.model, result.identified
     ratings = ratings_of(study, model.n_inputs)
+    counting = {
+        table.name: regulator_of(study, model, table).value_of_information for table in study.controllers
+    }
     return {
         "study": study.name,
         "steps": study.steps,
@@ -37,6 +41,7 @@ def summarise(result: StudyResult) -> dict[str, Any]:
                 "controllers": [
                     {
                         "name": table.name,
+                        "counts_on_later_data": counting[table.name],
                         **_controller(result.runs[scenario.name][table.name], study, ratings),
                     }
                     for table in study.controllers

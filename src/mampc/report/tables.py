@@ -90,13 +90,15 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
 
 
 def _estimators(scenario: dict[str, Any]) -> str | None:
-    """Who estimates with a load bank; None where all have a Kalman filter."""
+    """Who estimates with a load bank, and counts on later data; None where all have a Kalman filter."""
     banks = [entry["name"] for entry in scenario["controllers"] if entry["estimator"] == "load_bank"]
     if not banks:
         return None
+    counting = [entry["name"] for entry in scenario["controllers"] if entry["counts_on_later_data"]]
+    later = f" Plans count on later data: {', '.join(counting)}." if counting else ""
     if len(banks) == len(scenario["controllers"]):
-        return "All have a load bank."
-    return escape(f"With a load bank: {', '.join(banks)}; the others have a Kalman filter.")
+        return escape(f"All have a load bank.{later}")
+    return escape(f"With a load bank: {', '.join(banks)}; the others have a Kalman filter.{later}")
 
 
 def _wear_table(study: Study, scenario: dict[str, Any]) -> Table:
