@@ -33,6 +33,7 @@ from mampc.program.sample import Indices, LeastSquares, Sample
 
 BEAM = 32  # nodes of each move that the first plan is looked for among
 NEAREST = 5  # levels that it tries for each
+MANY = 20  # levels of an input, above which patterns are fewer than courses
 CACHE_BYTES = 64e6  # for the factors of recent patterns
 
 
@@ -91,11 +92,12 @@ class LevelSearch:
     def rounding_cost(self) -> float:
         """What it costs on average to round a move to a level where later moves make up for it, in prices.
 
-        Infinite where some move has no price.
+        Infinite where some move has no price, and where an input has so few levels that courses are soon searched.
         """
         m, price = self.admissible.n_inputs, self.admissible.price
         factor = self.factor(np.ones(self.condensed.n_moves, dtype=bool))
-        if not len(factor.moves) or not (price[factor.moves % m] > 0).all():
+        few = any(values is not None and len(values) < MANY for values in self.levels.values)
+        if few or not len(factor.moves) or not (price[factor.moves % m] > 0).all():
             return np.inf
         widths = np.array([
             0.0 if values is None or len(values) < 2 else (values[-1] - values[0]) / (len(values) - 1)
