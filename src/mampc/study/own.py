@@ -19,6 +19,8 @@ from mampc.base.errors import MampcError, listed
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.controllers.offset import HIGHEST_PRICE, highest_price
+from mampc.loop.defaults import FEW
+from mampc.loop.doubt import runs_away
 from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.regulator import Regulator
 from mampc.loop.simulation import simulate
@@ -35,7 +37,6 @@ MOST_CHANGES = 4  # of single outputs
 USUAL = 1 / 4  # of the highest price: most often it costs next to no error
 CHEAPER, PRICES = 4.0, 5  # how much lower the next price is that is tried, and how many are
 LITTLE = 1.25  # times the error of plain MPC
-TRIED = 12  # planned moves, up to which prices are tried in a moment
 DEAD_BAND = 0.01  # of the inputs' range
 LARGEST_WEIGHT = 1e9
 LEVEL_TAKES = 20  # samples behind dead times in which a level goes as far as all its inputs can move it
@@ -116,7 +117,7 @@ def _usual_price(
     still move, which is much beside the error of plain MPC where some modes are fast and others slow.
     """
     model, prices = problem.model, [highest * USUAL / CHEAPER**k for k in range(PRICES)]
-    if problem.control_horizon * model.n_inputs > TRIED:
+    if problem.control_horizon * model.n_inputs > FEW:
         return prices[0]
     reference, estimator = model.y_op + np.repeat(changes, every, axis=0), KalmanFilter.offset_free(model)
 
@@ -325,8 +326,7 @@ loads = [{{ kind = "random_walk", at = "output", size = {_list(_rounded(model.no
 
 def _later_data(problem: TrackingProblem) -> str:
     """Where a search is quick, and nothing runs away from a plan that waits."""
-    grows = np.abs(problem.model.poles()).max(initial=0.0) > 1 + 1e-9
-    if problem.control_horizon * problem.model.n_inputs > TRIED or grows:
+    if problem.control_horizon * problem.model.n_inputs > FEW or runs_away(problem.model):
         return ""
     return """
 [estimator]
