@@ -305,6 +305,19 @@ def test_integrators_beside_each_other_do_not_run_away_in_any_coordinates(seed, 
     assert runs_away(mampc.StateSpace(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T), None, 1.0))
 
 
+@pytest.mark.parametrize(("lags", "integrators", "runs"), [(3, 0, False), (3, 1, False), (3, 2, True)])
+@pytest.mark.parametrize("time_constant", [5.0, 2000.0])
+def test_lags_in_a_row_do_not_run_away_however_long_they_take(lags, integrators, runs, time_constant):
+    rates = [-1 / time_constant] * lags + [0.0] * integrators
+    n = len(rates)
+    chain = mampc.StateSpace(np.diag(rates) + np.eye(n, k=-1), np.eye(n, 1), np.eye(n)[-1:], None, 0.0)
+    assert runs_away(chain.discretise(1.0)) == runs
+
+
+def test_what_grows_beyond_all_numbers_runs_away():
+    assert runs_away(mampc.StateSpace([[5.0]], [[1.0]], [[1.0]], None, 1.0))
+
+
 def test_without_any_output_plans_count_on_the_bank_as_little_as_before():
     """What the inputs' moves make doubtful does not become certain where measurements fail."""
     model = MODELS["stable"]

@@ -9,6 +9,8 @@ import pytest
 import mampc
 from builders import random_model, tank_model, tank_problem
 from mampc import rivals
+from mampc.program.qp import QPStatus, QuadraticProgram
+from mampc.rivals.norms import Norm, NormsSolver
 from seeds import seeds
 
 SIZE = (0.5, 2.0)  # of penalties, per input
@@ -128,6 +130,14 @@ def test_norms_are_the_same_in_whatever_units(on, weight, made, seed):
         return decision.plan / a
 
     np.testing.assert_allclose(decided(*scales), decided(np.ones(2), np.ones(2)), atol=1e-4)
+
+
+def test_bounds_that_cross_are_refused_beside_norms_too():
+    program = QuadraticProgram(np.eye(2), np.zeros((0, 2)), 2)
+    solver = NormsSolver(program, [Norm(1.0, np.eye(2))])
+    low, high = np.array([-1.0, 1.0]), np.array([1.0, -1.0])
+    assert solver.solve(np.ones(2), low, high, [np.zeros(2)]).status is QPStatus.BAD_DATA
+    assert solver.solve(np.ones(2), -np.ones(2), np.ones(2), [np.zeros(2)]).status is QPStatus.OPTIMAL
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -61,16 +61,21 @@ class NormsSolver:
         self._cones = np.vstack(cones)
 
     def solve(self, f: Array, lower: Array, upper: Array, constants: Sequence[Array]) -> QPSolution:
-        """Minimise for f (n,), bounds (n_simple + rows,), and one constant (k,) a norm; no multipliers."""
+        """Minimise for f (n,), bounds (n_simple + rows,), and one constant (k,) a norm; no multipliers.
+
+        lower > upper gives the status BAD_DATA.
+        """
         import clarabel
         from scipy.sparse import csc_matrix
 
+        if (lower > upper).any():
+            return QPSolution(None, None, QPStatus.BAD_DATA, 0)
         scaled = f * self._unit
         away = [factor * c for factor, c in zip(self._factor, constants, strict=True)]
         size = max(np.abs(scaled).max(initial=0.0), *(np.abs(c).max() for c in away)) or 1.0
         low, high = lower * self._row / size, upper * self._row / size
-        fixed, above = lower == upper, (upper < GONE) & (lower < upper)
-        below = (lower > -GONE) & (lower < upper)
+        fixed = lower == upper
+        above, below = (upper < GONE) & ~fixed, (lower > -GONE) & ~fixed
         A = np.vstack([self._bounded[fixed], self._bounded[above], -self._bounded[below], self._cones])
         at_cones = np.concatenate([part for c in away for part in (np.zeros(1), c / size)])
         b = np.concatenate([high[fixed], high[above], -low[below], at_cones])

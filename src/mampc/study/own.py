@@ -156,10 +156,9 @@ def _held_gain(model: StateSpace, found: Properties, samples: int) -> tuple[Arra
         gain = model.dc_gain()[:, :m]  # of the steady state that a controller can hold
     gain = np.where(np.isfinite(gain), gain, 0.0)
     integrating = found.integrating[:, :m]
-    rows: BoolArray = np.any(integrating, axis=1)
     moved = np.where(integrating, model.step_response(samples + 1)[-1, :, :m], 0.0)
-    held: Array = np.where(rows[:, None], moved, gain)
-    return held, rows
+    held: Array = np.where(integrating.any(axis=1, keepdims=True), moved, gain)
+    return held, moved.any(axis=1)
 
 
 def _reachable(gain: Array, integrates: BoolArray, down: Array, up: Array) -> Array:
