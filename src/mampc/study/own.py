@@ -158,7 +158,8 @@ def _held_gain(model: StateSpace, found: Properties, samples: int) -> tuple[Arra
     integrating = found.integrating[:, :m]
     moved = np.where(integrating, model.step_response(samples + 1)[-1, :, :m], 0.0)
     held: Array = np.where(integrating.any(axis=1, keepdims=True), moved, gain)
-    return held, moved.any(axis=1)
+    rows: BoolArray = np.any(moved, axis=1)
+    return held, rows
 
 
 def _reachable(gain: Array, integrates: BoolArray, down: Array, up: Array) -> Array:
