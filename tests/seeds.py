@@ -9,7 +9,12 @@ DEEP = bool(os.environ.get("MAMPC_DEEP"))  # set by `make deep`
 
 def seeds(count, *, quick):
     """0..count-1, those from `quick` on marked slow."""
-    return [*range(quick), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(quick, count))]
+    return [*range(quick), *deep(*range(quick, count))]
+
+
+def deep(*values):
+    """Values of a parameter that are marked slow: others show the property as well."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 def examples(count, *, quick):

@@ -5,9 +5,9 @@ import pytest
 from scipy.signal import lfilter
 
 from mampc import IOData, MampcError, StateSpace, n4sid, prbs
-from seeds import seeds
+from seeds import deep, examples, seeds
 
-UNITS = [(1.0, 1.0), (1e-4, 1e5)]
+UNITS = [(1e-4, 1e5), *deep((1.0, 1.0))]
 
 
 def first_order(u, time_constant, gain=2.0, delay=0):
@@ -31,7 +31,7 @@ def gain_of(fitted, units=(1.0, 1.0)):
 
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("time_constant", [20, 60])
-@pytest.mark.parametrize("slope", [-20.0, 5.0, 20.0, 100.0])
+@pytest.mark.parametrize("slope", [5.0, 100.0, *deep(-20.0, 20.0)])
 def test_a_ramp_does_not_change_the_gain(slope, time_constant, units):
     record = record_with(
         lambda rng, N: slope * np.arange(N) / N, time_constant=time_constant, units=units, seed=1
@@ -46,7 +46,7 @@ def test_a_ramp_does_not_change_the_gain(slope, time_constant, units):
 
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("step", [0.05, 0.2])
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
+@pytest.mark.parametrize("seed", [0, *deep(2, 3)])
 def test_a_random_walk_leaves_the_gain_roughly_right(seed, step, units):
     record = record_with(
         lambda rng, N: step * np.cumsum(rng.standard_normal(N)), seed=seed, samples=2000, noise=0.02, units=units
@@ -71,8 +71,8 @@ def test_slow_and_fast_channels_keep_their_states_under_coloured_noise():
     assert (error < 0.2 * np.abs(gain).max(axis=1)).all()
 
 
-@pytest.mark.parametrize("periods", [0.6, 0.9, 2.0])
-@pytest.mark.parametrize("size", [2.0, 20.0])
+@pytest.mark.parametrize("periods", [0.6, 2.0, *deep(0.9)])
+@pytest.mark.parametrize("size", [20.0, *deep(2.0)])
 def test_a_slow_wave_does_not_change_the_gain_where_disturbances_are_made_white(size, periods):
     record = record_with(lambda rng, N: size * np.sin(2 * np.pi * periods * np.arange(N) / N + 1.0), seed=1)
     assert gain_of(n4sid(record, feedthrough=False, detrend="whitened")) == pytest.approx(2.0, abs=0.15)
@@ -103,7 +103,7 @@ def test_any_trend_may_be_asked_of_a_record_with_white_noise(detrend):
 
 
 def test_a_record_that_does_not_drift_is_not_detrended():
-    for seed in range(4):
+    for seed in range(examples(4, quick=2)):
         fitted = n4sid(record_with(lambda rng, N: 0.0, seed=seed), feedthrough=False)
         assert fitted.detrend == "constant"
         assert gain_of(fitted) == pytest.approx(2.0, abs=0.05)
@@ -137,11 +137,11 @@ def delayed_record(delays, time_constants, seed, *, noise=0.05, samples=2500, un
     return IOData(u * units[0], noisy * units[1], 1.0), IOData(u * units[0], y * units[1], 1.0)
 
 
-@pytest.mark.parametrize("units", [pytest.param(UNITS[0], marks=pytest.mark.slow), UNITS[1]])
-@pytest.mark.parametrize("noise", [pytest.param(0.02, marks=pytest.mark.slow), 0.1])
+@pytest.mark.parametrize("units", UNITS)
+@pytest.mark.parametrize("noise", [0.1, *deep(0.02)])
 @pytest.mark.parametrize(
-    "delays", [[[45]], [[150]], [[45, 45], [44, 46]], [[45, 5], [12, 30]]],
-    ids=["one", "long", "alike", "four"],
+    "delays", [[[150]], [[45, 5], [12, 30]], *deep([[45]], [[45, 45], [44, 46]])],
+    ids=["long", "four", "one", "alike"],
 )  # fmt: skip
 def test_dead_times_are_found_and_cost_no_fit(delays, noise, units):
     time_constants = [20, 40][: len(delays)]
@@ -157,7 +157,7 @@ def test_dead_times_are_found_and_cost_no_fit(delays, noise, units):
 
 
 def test_a_plant_without_dead_time_gets_none():
-    record, _ = delayed_record([[0, 1], [2, 0]], [20, 40], 2)
+    record, _ = delayed_record([[0, 1], [2, 0]], [20, 40], 2, samples=1200)
     assert np.array_equal(n4sid(record, feedthrough=False).delays, np.zeros((2, 2)))
 
 
@@ -187,7 +187,7 @@ def pieces(count, *, samples=400, offset=0.0, noise=0.02):
     return records
 
 
-@pytest.mark.parametrize("offset", [0.0, 5.0])
+@pytest.mark.parametrize("offset", [5.0, *deep(0.0)])
 def test_several_records_make_one_model_whatever_their_levels(offset):
     plant, records = two_by_two(), pieces(4, offset=offset)
     fitted = n4sid(records, feedthrough=False)
@@ -212,8 +212,8 @@ def test_dead_times_may_be_longer_than_a_piece_of_the_record(first):
 
 
 def test_a_record_cut_in_two_is_nearly_the_whole():
-    (whole,) = pieces(1, samples=1500)
-    cut = n4sid([whole[:700], whole[700:]], feedthrough=False)
+    (whole,) = pieces(1, samples=1000)
+    cut = n4sid([whole[:450], whole[450:]], feedthrough=False)
     np.testing.assert_allclose(
         cut.model.step_response(60), n4sid(whole, feedthrough=False).model.step_response(60), atol=0.05
     )
@@ -230,7 +230,7 @@ def test_records_that_do_not_belong_together_are_refused():
 
 def test_stages_are_told():
     told = []
-    n4sid(pieces(2), feedthrough=False, progress=told.append)
+    n4sid(pieces(2, samples=150), feedthrough=False, progress=told.append)
     assert told[0] == "looking for dead times"
     assert "all of the record" in told[-1]
     assert any("ARX" in stage for stage in told)
