@@ -18,7 +18,7 @@ SETTINGS = {
     "admm": {"starts": 3, "iterations": 10}, "reweighted_l1": {"reweightings": 1, "bisections": 6},
 }  # fmt: skip
 METHODS = ["mpc", "as in the paper", *mampc.METHODS]
-SEEDS = range(examples(40, quick=14))
+SEEDS = range(examples(40, quick=12))
 
 
 def random_limits(rng, model, n_c):

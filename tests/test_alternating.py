@@ -15,8 +15,9 @@ from mampc.methods.alternating import HardThreshold
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.program.daqp import DaqpSolver
 from mampc.program.qp import QuadraticProgram
+from seeds import examples
 
-SEEDS = range(20)
+SEEDS = range(examples(20, quick=12))
 LAMBDA, MU, EPS1 = 0.1, 2.0, 1e-3
 TIGHT = {"tol_gap_abs": 1e-13, "tol_gap_rel": 1e-13, "tol_feas": 1e-13}
 

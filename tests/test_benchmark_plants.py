@@ -128,7 +128,8 @@ def test_a_study_runs_on_each_of_them(kind, dt, amplitude, initial):
     text = template()
     text = text[: text.index("[problem]")].replace('"10 s"', str(dt)).replace('"quadruple-tank"', f'"{kind}"')
     text = text.replace("amplitude = 25.0", f"amplitude = {amplitude}").replace("steps = 145", "steps = 20")
-    text = text.replace("order = 4 ", "# order").replace("noise = 0.1 ", "noise = 0.0 ")
+    text = text.replace("prbs_order = 8 ", "prbs_order = 6 ").replace("noise = 0.1 ", "noise = 0.0 ")
+    text = text.replace("\norder = 4 ", "\n# order = 4 ")
     text += f"""
 [problem]
 prediction_horizon = 20

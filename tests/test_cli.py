@@ -225,13 +225,13 @@ def test_inspect_tells_what_is_missing_and_what_to_decide(tmp_path):
 def test_scattered_bad_values_do_not_spoil_a_model(tmp_path, few_figures):
     rng = np.random.default_rng(1)
     model = mampc.StateSpace([[0.9]], [[1.0]], [[1.0]], None, dt=10.0)
-    u = mampc.prbs(order=9, amplitude=1.0, hold=5)
+    u = mampc.prbs(order=8, amplitude=1.0, hold=4)
     y = model.response(u) + 0.1 * rng.standard_normal((len(u), 1))
     cells = [[f"{10 * k}", f"{a[0]}", f"{b[0]:.4f}"] for k, (a, b) in enumerate(zip(u, y, strict=True))]
-    for k in rng.choice(len(cells), 100, replace=False):
+    for k in rng.choice(len(cells), 40, replace=False):
         cells[k][2] = "Bad"
     (tmp_path / "a.csv").write_text("time,u,y\n" + "\n".join(map(",".join, cells)))
-    left_out, filled = "left out of the identification; --fill", "100 missing values put in"
+    left_out, filled = "left out of the identification; --fill", "40 missing values put in"
     for options, words in (((), left_out), (("--fill", "5"), filled)):
         done = call("identify", "a.csv", "--inputs", "u", "--outputs", "y", *options, cwd=tmp_path)
         assert done.returncode == 0, done.stderr

@@ -7,21 +7,16 @@ import pytest
 
 import mampc
 from mampc.systems.riccati import predicted_covariance
+from seeds import deep
 
 NEAR_ONE = (
     0.99,
-    0.995,
-    0.999,
     1 - 1e-4,
-    1 - 1e-6,
     1 - 1e-9,
-    1 - 1e-13,
     1.0,
-    1 + 1e-9,
     1 + 1e-6,
-    1.0001,
-    1.001,
     1.01,
+    *deep(0.995, 0.999, 1 - 1e-6, 1 - 1e-13, 1 + 1e-9, 1.0001, 1.001),
 )
 
 

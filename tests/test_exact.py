@@ -18,7 +18,7 @@ from mampc.moves.pattern_solver import PatternSolver
 from mampc.program.condensing import CondensedQP
 from mampc.program.qp import QPStatus
 from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
-from seeds import examples, seeds
+from seeds import deep, examples, seeds
 
 SEEDS = range(300)
 LAST_LOOKS = 20  # at the clock, until a search that is out of time has ended
@@ -106,7 +106,7 @@ def both_bookkeepings(monkeypatch):
         yield name
 
 
-@pytest.mark.parametrize("seed", seeds(300, quick=15))
+@pytest.mark.parametrize("seed", seeds(300, quick=10))
 def test_the_optimum_is_that_of_brute_force_with_both_bookkeepings(seed, monkeypatch):
     case = random_case(seed)
     problem, rules, past, x, reference = case
@@ -254,7 +254,7 @@ def test_out_of_time_the_best_plan_so_far_comes_with_a_valid_bound(seed, table, 
         assert_keeps_limits_and_rules(case, decision)
 
 
-@pytest.mark.parametrize("least_size", [0.0, 0.3])
+@pytest.mark.parametrize("least_size", [0.3, *deep(0.0)])
 def test_the_time_limit_is_kept_where_the_proof_is_out_of_reach(least_size, monkeypatch):
     model = random_model(3, n=4, m=4, l=4)
     problem = mampc.TrackingProblem(
@@ -272,7 +272,7 @@ def test_the_time_limit_is_kept_where_the_proof_is_out_of_reach(least_size, monk
     assert_keeps_limits_and_rules(case, decision)
 
 
-@pytest.mark.parametrize("seed", seeds(40, quick=15))
+@pytest.mark.parametrize("seed", seeds(40, quick=6))
 def test_rules_that_forbid_nothing_give_plain_mpc_and_those_that_forbid_all_hold(seed, monkeypatch):
     problem, _, past, x, reference = random_case(seed)
     plain = mampc.MPC(problem)
@@ -296,7 +296,7 @@ def test_rules_that_forbid_nothing_give_plain_mpc_and_those_that_forbid_all_hold
 def test_other_methods_certified_report_a_valid_bound_and_an_objective_as_planned(method):
     settings = {"warm_up": 0, "polish": True} if method == "alternating" else {}
     proven = 0
-    for seed in range(0, examples(300, quick=40), 4):
+    for seed in range(0, examples(300, quick=24), 4):
         problem, rules, past, x, reference = case = random_case(seed)
         best = best_value(seed, rules)
         plain, certified = decide(case, method, **settings), decide(case, method, certify=True, **settings)
@@ -325,7 +325,7 @@ def test_a_certificate_is_about_a_plan_that_keeps_the_rules(seed):
 
 
 @pytest.mark.parametrize("method", [name for name in mampc.METHODS if name != "alternating"])
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", seeds(10, quick=3))
 def test_nobody_pays_for_moves_that_limits_keep_at_zero(method, seed):
     rng, model, room = np.random.default_rng(seed), random_model(seed), np.array([1.0, 0.0])
     problem = mampc.TrackingProblem(
