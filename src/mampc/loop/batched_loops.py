@@ -121,7 +121,7 @@ class BatchedLoops:
         estimator = cast(KalmanFilter | LoadBank, regulator.estimator)
         estimate, innovation, _ = estimator.updates(last, u, y, self._v_last, told)
         fine = sensors.are_fine(self._sensors, y, innovation)
-        after = sensors.after_fine(self._sensors, y, estimator.loads_of(last))
+        after = sensors.after_fine(self._sensors, y, innovation, estimator.loads_of(last))
         asked = self._reference[k : k + self._n_p + 1].swapaxes(0, 1) if self._n_p else self._reference[k]
         tracked, ahead = self._tracked, asked.reshape(len(y), -1)
         if self._filter is not None and tracked is not None:

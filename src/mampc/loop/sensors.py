@@ -10,9 +10,11 @@ Every test is made against what the model predicts, since only that tells a faul
   balances a load: it takes twice as many samples, and movement by all of `largest_jump`. A stuck sensor is believed
   again once it changes; or, where no other output is believed either, after ten times `stuck_after` samples, since
   a plant at a hard stop (a tank that overflows) looks the same;
-- jump: further from its prediction than `largest_jump`. Where it stays there (`confirm` samples within
-  `largest_jump` of one another, or of where the model takes them), it is the plant that jumped, and it is believed,
-  unless it is a hundred times as far from the operating point as the inputs' whole range could move the output.
+- jump: further from its prediction than `largest_jump`; where the model integrates, so that the inputs' range says
+  little of the noise, by default seven and a half times as far as usual of late, if that is more. Where it stays there
+  (`confirm` samples within `largest_jump` of one another, or of where the model takes them), it is the plant that
+  jumped, and it is believed, unless it is a hundred times as far from the operating point as the inputs' whole range
+  could move the output.
 
 An output has one fault at a time, the first in this order.
 """
@@ -35,6 +37,11 @@ JUMP_OF_REACH = (
     0.1  # default largest jump, as a share of the reach: what the inputs' whole range does to an output
 )
 JUMP_OF_NOISE = 6.0  # and at least so many standard deviations of the noise, where it is known
+JUMP_OF_SURPRISE = (
+    7.5  # and so many times the usual surprise: 6 standard deviations, whose mean size is 0.8 of one
+)
+SURPRISE_FORGOTTEN = 0.05  # share of the usual surprise that each sample replaces
+SMALL_SURPRISE = 0.25  # of the largest jump: below it a surprise says nothing of the largest jump
 REACH_WITHIN = 10  # samples within which the inputs reach an output that washes out before its steady state
 ABSURD_OF_REACH = (
     100.0  # times the reach from the operating point no plant gets; nothing there is ever believed
@@ -60,7 +67,8 @@ class SensorChecks:
         largest_jump: distance from its prediction at which a measurement is believed at once, in output
             units, a scalar or (l,). Default: a tenth of what the inputs' whole range does to that output,
             where that range is finite, and six times the noise at least, as a load bank was told it or as
-            the model keeps it; infinite (no test for jumps and stuck sensors) elsewhere.
+            the model keeps it; more where a model integrates and outputs are usually further from their
+            predictions; infinite (no test for jumps and stuck sensors) elsewhere.
         confirm: >= 1, samples after which a jump that stays is believed.
         stuck_after: >= 2, equal samples after which a sensor may be stuck; None for never.
 
@@ -97,6 +105,8 @@ class SensorState:
         loads: what the estimator had found of loads when the present number of each output first came, shape (l, k).
         longest: run of equal numbers, in samples, that ended with a change although the model moved the output.
         step: that all its changes were multiples of, as long as it is not small; 0 before the first.
+        surprise: running mean of the distance from the prediction, counted up to the largest jump; 0 where it is
+            too small to matter, and where nothing is learnt of it.
         blind: samples in a row without any output believed.
     """
 
@@ -108,6 +118,7 @@ class SensorState:
     loads: Array
     longest: Array
     step: Array
+    surprise: Array
     blind: int = 0
 
 
@@ -135,12 +146,13 @@ class Sensors:
             raise MampcError(f"sensors: expected y_low < y_high, received {low} and {high}")
         largest = np.nextafter(LARGEST, 0.0)  # what is as large as `LARGEST` is missing, not in range
         self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
-        reach = _reach(problem)
+        reach, settles = _reach(problem)
         self._jump = JUMP_OF_REACH * reach
         if noise is None and problem.model.noise is not None:
             noise = problem.model.noise.output
         if noise is not None:
             self._jump = np.maximum(self._jump, JUMP_OF_NOISE * noise)
+        learns = checks.largest_jump is None and not settles
         if checks.largest_jump is not None:
             self._jump = _largest_jump(checks.largest_jump, l)
         self._absurd, self._y_op = ABSURD_OF_REACH * reach, problem.model.y_op
@@ -149,6 +161,9 @@ class Sensors:
         self._coarse_step = COARSE_STEP * self._jump
         self._coarse = self._coarse_step.tolist()
         self._bounds = np.stack([self._jump, self._low, self._high], axis=1).tolist()
+        self._small_surprise = SMALL_SURPRISE * self._jump if learns else np.full(l, np.inf)
+        self._small = self._small_surprise.tolist()
+        self._forgotten = self._small_surprise / JUMP_OF_SURPRISE  # no largest jump comes of it
         self._confirm = checks.confirm
         self._stuck_after = np.inf if checks.stuck_after is None else checks.stuck_after
         self._names = problem.model.names.outputs
@@ -158,7 +173,7 @@ class Sensors:
     def initial(self, loads: Array) -> SensorState:
         """Before the first sample, with `loads` as in `update`."""
         zeros = self._zeros
-        return SensorState(zeros, zeros, zeros, zeros, zeros, self._each(loads), zeros, zeros)
+        return SensorState(zeros, zeros, zeros, zeros, zeros, self._each(loads), zeros, zeros, zeros)
 
     def update(
         self, state: SensorState, y: Array, innovation: Array, movement: Array, loads: Array
@@ -173,7 +188,7 @@ class Sensors:
             loads: what the estimator has found of them before this sample, shape (k,).
         """
         if self._is_fine(state, y, innovation):  # the everyday case, at once
-            return self._fine, self.after_fine(state, y, loads)
+            return self._fine, self.after_fine(state, y, innovation, loads)
         missing = ~((y > -LARGEST) & (y < LARGEST))
         out = ~missing & ((y < self._low) | (y > self._high))
         came = ~(missing | out)
@@ -183,8 +198,9 @@ class Sensors:
         stuck = came & ~changed & self._is_stuck(state, repeats, moved)
         if state.blind >= BELIEVED_AGAIN * self._stuck_after:
             repeats[stuck], moved[stuck], stuck = 0.0, 0.0, self._none
-        jumped = came & ~stuck & (np.abs(innovation) > self._jump)
-        doubted = self._doubted(state, y, movement, jumped)
+        largest = np.maximum(self._jump, JUMP_OF_SURPRISE * state.surprise)
+        jumped = came & ~stuck & (np.abs(innovation) > largest)
+        doubted = self._doubted(state, y, movement, jumped, largest)
         jump = jumped & (doubted < self._confirm)
         believed = came & ~stuck & ~jump
         after = SensorState(
@@ -193,6 +209,7 @@ class Sensors:
             np.where(came, doubted, state.doubted),
             np.where(changed[:, None], loads, state.loads),
             self._longest(state, changed), self._step(state, y, changed),
+            self._surprise(state.surprise, innovation, came & ~stuck),
             0 if believed.any() else state.blind + 1,
         )  # fmt: skip
         found = (
@@ -217,11 +234,24 @@ class Sensors:
         fine: BoolArray = np.asarray(near.all(axis=1))
         return fine
 
-    def after_fine(self, state: SensorState, y: Array, loads: Array) -> SensorState:
+    def after_fine(self, state: SensorState, y: Array, innovation: Array, loads: Array) -> SensorState:
         """The next state where all outputs were fine, of one loop or of many."""
         zeros = self._zeros if y.ndim == 1 else np.zeros_like(y)
         step, longest = self._step(state, y, self._all), self._longest(state, self._all)
-        return SensorState(y.copy(), zeros, zeros, zeros, zeros, self._each(loads), longest, step)
+        surprise = self._surprise(state.surprise, innovation, self._all)
+        return SensorState(y.copy(), zeros, zeros, zeros, zeros, self._each(loads), longest, step, surprise)
+
+    def _surprise(self, surprise: Array, innovation: Array, came: BoolArray) -> Array:
+        """The usual distance from the prediction with this sample, shape (l,), or of many loops."""
+        if surprise is self._zeros and all(
+            -small <= e <= small for e, small in zip(innovation.tolist(), self._small, strict=True)
+        ):
+            return surprise
+        counted = np.minimum(np.abs(innovation), np.maximum(self._jump, JUMP_OF_SURPRISE * surprise))
+        matters = came & ((counted > self._small_surprise) | (surprise > self._forgotten))
+        latest = surprise + SURPRISE_FORGOTTEN * (np.where(matters, counted, surprise) - surprise)
+        after: Array = np.where(matters, latest, np.where(came, 0.0, surprise))
+        return after if after.any() or after.ndim > 1 else self._zeros
 
     def _each(self, loads: Array) -> Array:
         """The loads (k,) once for every output, shape (l, k), of one loop or of many."""
@@ -233,17 +263,19 @@ class Sensors:
         least = np.where(coarse, COARSE_PATIENCE, 1.0) * self._stuck_after
         longest = LONGEST_PATIENCE * self._stuck_after
         long = repeats >= np.clip(LONGER_THAN_USUAL * state.longest, least, longest)
-        moves = np.abs(moved) > np.where(coarse, self._jump, self._stuck_movement)
+        moves = np.abs(moved) > np.where(coarse, np.maximum(self._jump, state.step), self._stuck_movement)
         stuck: BoolArray = (state.stuck != 0.0) | (long & moves)
         return stuck
 
-    def _doubted(self, state: SensorState, y: Array, movement: Array, jumped: BoolArray) -> Array:
+    def _doubted(
+        self, state: SensorState, y: Array, movement: Array, jumped: BoolArray, largest: Array
+    ) -> Array:
         """For how many samples in a row each output has jumped to about the same place, shape (l,).
 
         From there it may go on as the model says: an integrator at full speed gets far in a sample.
         """
         gone = np.minimum(np.abs(y - state.y), np.abs(y - state.y - movement))
-        near = (gone <= self._jump) & (np.abs(y - self._y_op) < self._absurd)
+        near = (gone <= largest) & (np.abs(y - self._y_op) < self._absurd)
         return np.where(jumped, 1.0 + np.where(near, state.doubted, 0.0), 0.0)
 
     def _longest(self, state: SensorState, changed: BoolArray) -> Array:
@@ -281,12 +313,13 @@ def _largest_jump(told: Any, l: int) -> Array:
     return jump
 
 
-def _reach(problem: TrackingProblem) -> Array:
-    """How far the whole range of the inputs moves each output, in a steady state or soon, shape (l,)."""
+def _reach(problem: TrackingProblem) -> tuple[Array, bool]:
+    """How far the whole range of the inputs moves each output, in a steady state or soon, shape (l,); is there one?"""
     model, limits, m = problem.model, problem.limits, problem.model.n_inputs
     gain = np.abs(model.step_response(REACH_WITHIN + 1)[:, :, :m]).max(axis=0)  # an output may wash out
+    settles = False
     with suppress(MampcError):  # an integrator has no other
-        gain = np.maximum(gain, np.abs(model.dc_gain()[:, :m]))
+        gain, settles = np.maximum(gain, np.abs(model.dc_gain()[:, :m])), True
     ranges = np.broadcast_to(limits.u_max - limits.u_min, gain.shape)
     reach: Array = (gain * np.where(gain > 0, ranges, 0.0)).sum(axis=1)
-    return np.where(reach > 0, reach, np.inf)
+    return np.where(reach > 0, reach, np.inf), settles
