@@ -346,7 +346,7 @@ def test_excel_files(tmp_path):
     assert [len(record) for record in export.records] == [5, 6]
     assert told(export, "first in row 9")
     path.write_bytes(path.read_bytes()[:3000])
-    with pytest.raises(MampcError, match="expected a readable Excel file"):
+    with pytest.raises(MampcError, match="expected a readable"):
         read_export(path, inputs="u", outputs="y")
 
 

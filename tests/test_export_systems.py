@@ -1,5 +1,11 @@
 """Exports as particular systems write them, and what their texts went through."""
 
+import bz2
+import gzip
+import io
+import lzma
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -31,6 +37,8 @@ SYSTEMS = {
     "a mark of bytes before a row": text(rows()[:6]) + "\ufeff" + text(rows())[len(text(rows()[:6])) :],
     "Fortran": text([[time, f"{float(u):.4E}".replace("E", "D"), y] for time, u, y in rows()]),
     "zeros at the end": text(rows()) + "\0" * 500,
+    "durations of MATLAB in seconds": text([[f"{60 * k} sec", u, y] for k, (_, u, y) in enumerate(rows())]),
+    "durations of MATLAB": text([[f"{k} min", u, y] for k, (_, u, y) in enumerate(rows())]),
 }  # fmt: skip
 
 
@@ -41,6 +49,45 @@ def test_what_systems_write_around_their_numbers(tmp_path, form):
 
 def test_text_of_four_bytes_a_letter(tmp_path):
     assert_whole(read(tmp_path, text(rows()), "utf-32"))
+
+
+def zipped(*names, content="t,u,y"):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name in names:
+            archive.writestr(name, content)
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize("kind", [gzip, bz2, lzma])
+def test_compressed_files_are_read_and_damaged_ones_refused(tmp_path, kind):
+    packed = kind.compress(text(rows()).encode())
+    assert_whole(read(tmp_path, packed))
+    with pytest.raises(MampcError, match="received when unpacked"):
+        read(tmp_path, packed[:-20])
+
+
+def test_an_archive_of_one_file_is_read_and_another_refused(tmp_path):
+    export = read(tmp_path, zipped("may/", "may/plant.csv", "__MACOSX/may/._plant.csv", content=text(rows())))
+    assert_whole(export)
+    assert told(export, "'may/plant.csv' read out of the archive")
+    for names in ((), ("may.csv", "june.csv")):
+        with pytest.raises(
+            MampcError, match=f"of one file, received {len(names)}.*unpack it and name the files"
+        ):
+            read(tmp_path, zipped(*names))
+
+
+def test_what_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("mampc.identification.export.text.FILE_LIMIT", 1000)
+    for packed in (gzip.compress(bytes(1001)), zipped("a.csv", content=bytes(1001))):
+        with pytest.raises(MampcError, match="that unpacks to"):
+            read(tmp_path, packed)
+
+
+def test_groups_of_thousands_as_in_india(tmp_path):
+    [record] = read(tmp_path, text(rows(y=[f'"1,20,{k:03}"' for k in range(len(U))]))).records
+    np.testing.assert_array_equal(record.y[:, 0], 120_000 + np.arange(len(U)))
 
 
 @pytest.mark.parametrize("space", ["\u2009", "\u2007", "\u00a0", "´", " "])

@@ -49,6 +49,29 @@ def test_a_gap_past_midnight_stays_a_gap_and_times_that_go_back_by_day_are_refus
         read(tmp_path, text(lines[6:] + lines[:6]))
 
 
+@pytest.mark.parametrize(
+    ("start", "form", "name"),
+    [
+        ("09:30:00", "%M:%S", "time"),
+        ("09:05:00", "%M:%S.0", "time"),
+        ("09:00:00", "%M:%S", "elapsed (mm:ss)"),
+    ],
+)
+def test_minutes_and_seconds_are_known_by_their_size_their_parts_or_their_name(tmp_path, start, form, name):
+    times = stamps(dt=10.0, start=f"2024-04-13 {start}", form=form)
+    export = read(tmp_path, text(rows(times), header=(name, "u", "y")))
+    assert_whole(export, dt=10.0)
+    assert told(export, f"times such as {times[0]!r}", "are minutes and seconds")
+
+
+@pytest.mark.parametrize("options", [{}, {"time_format": "%M:%S"}])
+def test_minutes_that_begin_again_are_refused(tmp_path, options):
+    with pytest.raises(
+        MampcError, match="have no hour and no date, and begin again in row 4; save them with both"
+    ):
+        read(tmp_path, text(rows(stamps(form="%M:%S"))), **options)
+
+
 @pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M", "%H:%M:%S"])
 def test_a_day_may_end_at_24(tmp_path, form):
     times = stamps(start="2024-04-13 23:55:00", form=form)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -13,28 +13,35 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import shown
 from mampc.identification.export.date_words import plain_date
-from mampc.identification.export.daytime import CLOCK_ONLY, doubt_half_days, on_next_days
+from mampc.identification.export.daytime import (
+    DAY,
+    FIELDS,
+    HOUR,
+    MINUTES_FIRST,
+    UNDATED,
+    doubt_half_days,
+    on_next_days,
+    times_of_day,
+)
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import find_column
-from mampc.identification.export.numbers import clean, is_number, numeric_share
+from mampc.identification.export.numbers import clean, is_number, numeric_share, says_numbers
 from mampc.identification.export.numeric_times import from_numbers
 from mampc.identification.export.sheet import Cells, Sheet
 from mampc.identification.export.stamps import (
     DATE_ONLY,
     TimeReading,
     clock_put_back,
-    elapsed,
     from_stamps,
-    iso_stamps,
     plain_stamps,
     since_first,
+    ticks_of,
 )
 
 NAMES = re.compile(
     r"(time|t|timestamp|date|datetime|elapsed|seconds|zeit|zeitstempel|temps|tiempo|tempo|tijd|tid)([\W_].*)?"
 )
 STAMP = re.compile(r"[^\d]{0,5}\d+[-/.:, T]+\w+[-/.:, T]+\d+.*|\d{8}[T ]\d{4,6}.*")
-UNDATED = datetime(1900, 1, 1)  # the day of times without a date
 EXACT = ("time", "timestamp")
 
 
@@ -82,37 +89,24 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     name = " and ".join(sheet.header[at] for at in columns)
     seconds: Array
     origin: Any
-    told = how.time_format is not None or how.time_zone is not None
-    if len(columns) == 1 and how.time_format is None and numeric_share(_sampled(sheet, columns[0])) > 0.5:
+    alone = len(columns) == 1 and how.time_format is None
+    first = [" ".join(row[at] for at in columns) for row in sheet.sample]
+    if alone and says_numbers(first):
         seconds, origin = from_numbers(sheet, columns[0], how, findings), None
-    elif len(columns) == 1 and not told and (plain := plain_stamps(sheet.chunks(columns))) is not None:
-        seconds = clock_put_back(*plain, sheet, findings)
-        origin = plain[1]
-    elif (
-        len(columns) == 1
-        and how.time_format is None
-        and (stamps := iso_stamps(sheet.chunks(columns))) is not None
-    ):
-        seconds, origin = since_first(stamps, how, sheet, findings)
+    elif alone and how.time_zone is None and (plain := plain_stamps(sheet.chunks(columns))) is not None:
+        seconds, origin = clock_put_back(*plain, sheet, findings), plain[1]
+    elif alone and _share(first, FIELDS.fullmatch) > 0.5:
+        told = MINUTES_FIRST.search(f"{name} {sheet.units.get(columns[0], '')}") is not None
+        seconds, origin = times_of_day(_words(sheet, columns, findings), name, told, sheet, findings)
+    elif any(not isinstance(cells, list) for cells in next(sheet.chunks(columns))):
+        stamps: Any = sheet.column(columns[0])
+        seconds, origin = since_first(ticks_of(stamps), stamps.dt.tz is not None, how, sheet, findings)
     else:
-        cells = sheet.column(columns[0])
-        if len(columns) == 2:
-            days = _held(cells, sheet.header[columns[0]], findings)
-            hours = sheet.column(columns[1])
-            cells = [f"{day} {hour}".strip() for day, hour in zip(days, hours, strict=True)]
-        if isinstance(cells, list) and how.time_format is None and (spans := elapsed(cells)) is not None:
-            findings.note(f"times in column {name!r} are spans such as {spans[0]!r}")
-            seconds, origin = spans[1], None
-        elif not isinstance(cells, list):
-            seconds, origin = since_first(cells, how, sheet, findings)
-        else:
-            seconds, origin = from_stamps(cells, how, sheet, name, findings)
-            example = next((cell for cell in cells if CLOCK_ONLY.fullmatch(plain_date(cell))), None)
-            if example is not None and CLOCK_ONLY.fullmatch(plain_date(cells[-1])):
-                seconds = on_next_days(seconds, example, name, sheet, findings)
-                if example.count(":") == 1:
-                    findings.note(f"times such as {example!r} in column {name!r} are hours and minutes")
-        doubt_half_days(seconds, name, sheet, findings)
+        seconds, origin = from_stamps(_words(sheet, columns, findings), how, sheet, name, findings)
+        if origin is not None and origin.year == UNDATED.year:
+            period = DAY if re.search("%[HI]", how.time_format or "%H") else HOUR
+            seconds = on_next_days(seconds, first[0], name, sheet, findings, period)
+    doubt_half_days(seconds, name, sheet, findings)
     unreadable = np.flatnonzero(np.isnan(seconds))
     if len(unreadable) == len(seconds):
         findings.doubt(
@@ -136,16 +130,21 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     return Clock(name, columns, seconds, origin)
 
 
-def _held(days: Cells, name: str, findings: Findings) -> list[str]:
-    """Dates, the last one in empty cells."""
-    held, last, put = [], "", 0
-    for day in map(str, days):
-        put += not day and bool(last)
-        last = day or last
-        held.append(last)
-    if put:
-        findings.change(f"dates in column {name!r} held in {put} rows without one")
-    return held
+def _words(sheet: Sheet, columns: Sequence[int], findings: Findings) -> Iterator[list[str]]:
+    """The cells of the column, or of those of dates and times put together, the last date in empty cells."""
+    date, held = "", 0
+    for cells in sheet.chunks(columns):
+        if len(cells) == 1:
+            yield [str(cell) for cell in cells[0]]
+            continue
+        words = []
+        for own, time in zip(*(map(str, column) for column in cells), strict=True):
+            held += not own and bool(date)
+            date = own or date
+            words.append(f"{date} {time}".strip())
+        yield words
+    if held:
+        findings.change(f"dates in column {sheet.header[columns[0]]!r} held in {held} rows without one")
 
 
 def _cell(sheet: Sheet, columns: Sequence[int], at: int) -> str:
@@ -163,14 +162,14 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
         return () if at is None else (at,)
     free = [at for at in range(len(sheet.header)) if at not in taken]
     shares = {
-        kind: [at for at in free if _share(sheet, at, test) > 0.5]
+        kind: [at for at in free if _share(_sampled(sheet, at), test) > 0.5]
         for kind, test in (
             (
                 "stamps",
-                lambda cell: STAMP.fullmatch(cell) and not (CLOCK_ONLY.fullmatch(cell) or is_number(cell)),
+                lambda cell: STAMP.fullmatch(cell) and not (FIELDS.fullmatch(cell) or is_number(cell)),
             ),
             ("dates", DATE_ONLY.fullmatch),
-            ("hours", CLOCK_ONLY.fullmatch),
+            ("hours", FIELDS.fullmatch),
         )
     }
     dates, hours = shares["dates"], shares["hours"]
@@ -180,7 +179,7 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
     numeric = [
         at
         for at in free
-        if numeric_share(_sampled(sheet, at)) > 0.5
+        if says_numbers(_sampled(sheet, at))
         and (
             sheet.header[at].casefold() in EXACT
             or (NAMES.fullmatch(sheet.header[at].casefold()) and _runs_on(sheet, at, 0.8))
@@ -215,9 +214,9 @@ def _sampled(sheet: Sheet, at: int) -> list[str]:
     return [row[at] for row in sheet.sample]
 
 
-def _share(sheet: Sheet, at: int, test: Callable[[str], Any]) -> float:
-    cells = [plain_date(clean(cell)) for cell in _sampled(sheet, at) if cell]
-    return sum(bool(test(cell)) for cell in cells) / len(cells) if cells else 0.0
+def _share(cells: Sequence[str], test: Callable[[str], Any]) -> float:
+    plain = [plain_date(clean(cell)) for cell in cells if cell]
+    return sum(bool(test(cell)) for cell in plain) / len(plain) if plain else 0.0
 
 
 def _runs_on(sheet: Sheet, at: int, share: float, *, evenly: bool = False) -> bool:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 
-# First letters that tell a month in English, German, French, Spanish, Italian, Dutch, Portuguese.
+# First letters that tell a month in English, German, French, Spanish, Italian, Dutch, Portuguese, Russian, Polish.
 MONTHS = (
-    ("jan", "ene", "gen", "jän"), ("feb", "fév", "fev"), ("mar", "mär", "mrz", "maa", "mrt"), ("apr", "avr", "abr"),
-    ("may", "mai", "mag", "mei", "maj"), ("jun", "juin", "giu"), ("jul", "juil", "lug"), ("aug", "aoû", "aou", "ago"),
-    ("sep", "set"), ("oct", "okt", "ott", "out"), ("nov",), ("dec", "dez", "déc", "dic", "des"),
+    ("jan", "ene", "gen", "jän", "янв", "sty"), ("feb", "fév", "fev", "фев", "lut"),
+    ("mar", "mär", "mrz", "maa", "mrt", "мар"), ("apr", "avr", "abr", "апр", "kwi"),
+    ("may", "mai", "mag", "mei", "maj", "мая", "май"), ("jun", "juin", "giu", "июн", "cze"),
+    ("jul", "juil", "lug", "июл", "lip"), ("aug", "aoû", "aou", "ago", "авг", "sie"),
+    ("sep", "set", "сен", "wrz"), ("oct", "okt", "ott", "out", "окт", "paź"), ("nov", "ноя", "lis"),
+    ("dec", "dez", "déc", "dic", "des", "дек", "gru"),
 )  # fmt: skip
 ENGLISH = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 BY_LETTERS = {word: name for name, words in zip(ENGLISH, MONTHS, strict=True) for word in words}
@@ -33,17 +36,29 @@ HOUR = re.compile(r"(?<!\d)\d{1,2}:\d\d(:\d\d([.,]\d+)?)?")
 TAIL = re.compile(r"\s*(Uhr|\[[\w/+-]+\])$|\s?(UTC|GMT)(?=[+-]\d)")
 OF = re.compile(r"(?<=\w )(de|del) (?=\w)")
 DAY = re.compile(r"^(\d{1,2})\. ?(?=[^\W\d_])")
+AT = re.compile(r",? (?:klo|kl\.?|um|à|at|ore|alle) (?=\d)|, (?=\d)")  # between the date and the time
+HOURS = re.compile(r"(?<![\d:.])(\d{1,2}) ?h ?(\d\d)(?: ?m(?:in)? ?(\d\d) ?s?)?(?!\w)", re.IGNORECASE)
+POINTS = re.compile(r"(?<=\d )(\d{1,2})\.(\d\d)(?:\.(\d\d))?(?![\d.:])")
+YEAR_POINT = re.compile(r"^(\d{4})\. ?(\d{1,2})\. ?(\d{1,2})\. ")
 
 
 def plain_date(stamp: str) -> str:
     """A stamp without its day of the week, with an English month, the year beside it, and its offset behind the time.
 
-    "Thu Nov 26 21:00:00 CET 2026" becomes "Nov 26 2026 21:00:00+0100", "02. März 2026 06:00" "02 Mar 2026 06:00",
-    "2/3/2026 9:00 p. m." "2/3/2026 9:00 PM".
+    "Thu Nov 26 21:00:00 CET 2026" becomes "Nov 26 2026 21:00:00+0100", "02. März 2026 um 06.00" "02 Mar 2026 06:00",
+    "2/3/2026, 9:00 p. m." "2/3/2026 9:00 PM".
     """
-    if not any(map(str.isalpha, stamp)):
-        return OFFSET.sub(r"\1\2", stamp)
-    stamp = TAIL.sub("", stamp)
+    words = any(map(str.isalpha, stamp))
+    if words:
+        stamp = HOURS.sub(_with_colons, TAIL.sub("", stamp))
+    if words or ", " in stamp:
+        stamp = AT.sub(" ", stamp)
+    if ". " in stamp:
+        stamp = YEAR_POINT.sub(r"\1-\2-\3 ", stamp)
+    if "." in stamp.partition(" ")[2]:
+        stamp = POINTS.sub(_with_colons, stamp)
+    if not words:
+        return OFFSET.sub(r"\1\2", stamp) if " +" in stamp or " -" in stamp else stamp
     half = HALVES.search(stamp)
     if half:
         name = "AM" if half[2] or (half[1] or "").casefold() == "a" else "PM"
@@ -62,6 +77,10 @@ def plain_date(stamp: str) -> str:
     if moved:
         stamp = f"{moved[1]} {moved[4]} {moved[2]} {moved[3] or ''}".strip()
     return OFFSET.sub(r"\1\2", stamp)
+
+
+def _with_colons(time: re.Match[str]) -> str:
+    return ":".join(field for field in time.groups() if field)
 
 
 def _month(word: str) -> str | None:

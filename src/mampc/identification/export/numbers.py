@@ -19,8 +19,9 @@ from mampc.identification.export.sheet import Cells, Sheet
 PLAIN_CHARACTERS = frozenset("0123456789+-.eE \n")
 POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 FORTRAN = re.compile(r"([+-]?(?:\d+[.,]\d*|[.,]\d+))[dD]([+-]?\d+)", re.ASCII)
-GROUPED = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", re.ASCII)  # 1,234 or 1,234,567.8
-GROUPED_FOR_SURE = re.compile(r"[+-]?\d{1,3}((,\d{3})+\.\d*|(,\d{3}){2,})", re.ASCII)
+INDIAN = r"\d{1,2}(,\d{2})+,\d{3}(\.\d*)?"  # 12,34,567.8
+GROUPED = re.compile(rf"[+-]?(\d{{1,3}}(,\d{{3}})+(\.\d*)?|{INDIAN})", re.ASCII)  # 1,234 or 1,234,567.8
+GROUPED_FOR_SURE = re.compile(rf"[+-]?(\d{{1,3}}((,\d{{3}})+\.\d*|(,\d{{3}}){{2,}})|{INDIAN})", re.ASCII)
 SPACE = re.compile(SPACES)  # a plain space may part two numbers
 APART = re.compile(r"[+-]?\d{1,3}( \d{3})+([.,]\d*)?", re.ASCII)
 APART_FOR_SURE = re.compile(r"[+-]?\d{1,3}(( \d{3})+[.,]\d*|( \d{3}){2,})", re.ASCII)

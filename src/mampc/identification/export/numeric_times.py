@@ -7,6 +7,7 @@ import re
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.identification.export.cell_words import without_unit
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.numbers import POINT, clean
 from mampc.identification.export.sheet import Sheet
@@ -21,12 +22,13 @@ WORDS_ONLY_ALONE = ("day", "second")  # "time of day" says nothing of a unit
 
 def from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) -> Array:
     """The times of a column of numbers, in seconds, shape (N,)."""
-    name, values = sheet.header[at], _values(sheet, at)
-    unit = how.time_unit or _unit(sheet, at)
+    name = sheet.header[at]
+    values, behind = _values(sheet, at)
+    unit = behind or how.time_unit or _unit(sheet, at)
     if unit in SECONDS:
         if SECONDS[unit] != 1.0:
             findings.note(f"times in column {name!r} are in {unit}")
-        return values * SECONDS[unit]
+        return values if behind else values * SECONDS[unit]
     known = values[~np.isnan(values)]
     least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     usual = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
@@ -60,18 +62,22 @@ def from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) ->
     return values
 
 
-def _values(sheet: Sheet, at: int) -> Array:
-    values = np.empty(len(sheet))
+def _values(sheet: Sheet, at: int) -> tuple[Array, str]:
+    """The numbers; those with a unit of time behind them in seconds, and what that unit is."""
+    values, behind = np.empty(len(sheet)), ""
     start = 0
     for [cells] in sheet.chunks([at]):
         part = values[start : start + len(cells)]
         start += len(cells)
-        if isinstance(cells, list):
-            words = (clean(cell).replace(",", ".") for cell in cells)
-            part[:] = [float(word) if POINT.fullmatch(word) else np.nan for word in words]
-        else:
+        if not isinstance(cells, list):
             part[:] = cells
-    return values
+            continue
+        for i, cell in enumerate(cells):
+            number, unit = without_unit(clean(cell).replace(",", "."))
+            scale = SECONDS.get(unit, np.nan) if unit else 1.0
+            part[i] = scale * float(number) if POINT.fullmatch(number) else np.nan
+            behind = behind or unit
+    return values, behind
 
 
 def _unit(sheet: Sheet, at: int) -> str:

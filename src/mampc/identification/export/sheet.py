@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import codecs
-import csv
-import io
 import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,7 +18,6 @@ from mampc.base.files import read_bounded
 from mampc.identification.export.cell_words import without_unit
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import (
-    NOT_UTF_8,
     REMARK,
     RULE,
     Row,
@@ -37,22 +33,17 @@ from mampc.identification.export.header import (
     require_columns,
     without_empty_end,
 )
+from mampc.identification.export.text import FILE_LIMIT, KIND, ZIP, Rows, encoding_of, text_rows, unpacked
 from mampc.identification.export.workbook import read_parquet, read_workbook
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FILE_LIMIT = 256 * 2**20  # bytes
-KIND = "CSV, Excel or Parquet file"
-SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+SEPARATORS = ",;\t| "
 HEAD = 200  # rows among which the header is looked for
-MARK = "\ufeff"  # of the order of bytes, inside a text where files were put together
-CHUNK = 20_000  # rows parsed at a time
-BINARY = re.compile(rb"[\x00-\x08\x0e-\x19\x1c-\x1f]|\x1a(?!\s*$)")
 
 # Words as they stand, numbers, or a pandas Series of times.
 Cells: TypeAlias = "list[str] | npt.NDArray[Any] | pd.Series"
-Rows: TypeAlias = Callable[[], Iterator[list[Row]]]  # all rows from the first on, in blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,18 +92,18 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings, encoding: 
 
     if not isinstance(source, (str, Path)):
         return frame_sheet(source, names, findings)
-    content = read_bounded(source, FILE_LIMIT, KIND)
+    content = unpacked(source, read_bounded(source, FILE_LIMIT, KIND), findings)
     if content.startswith(b"PAR1"):
         return frame_sheet(read_parquet(source, content), names, findings)
-    if content.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+    if content.startswith(ZIP):
         worksheets = read_workbook(source, content)
         return _row_sheet([(None, rows) for rows in worksheets], names, findings)
     if content.startswith(b"\xd0\xcf\x11\xe0"):
         raise MampcError(
             f"{source}: expected a readable {KIND}, received an old Excel file; save it as .xlsx"
         )
-    if content.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf")):
-        raise MampcError(f"{source}: expected a readable {KIND}, received a compressed one; unpack it first")
+    if content.startswith(b"7z\xbc\xaf"):
+        raise MampcError(f"{source}: expected a readable {KIND}, received an archive; unpack it first")
     if content[:100].lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
         raise MampcError(
             f"{source}: expected a readable {KIND}, received HTML or XML; save it as .xlsx or CSV"
@@ -120,55 +111,12 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings, encoding: 
     whole, content = len(content), content.rstrip(b"\0") if content.endswith(bytes(8)) else content
     if len(content) < whole:
         findings.note(f"{whole - len(content)} bytes of nothing at the end of the file left out")
-    encoding = _encoding(source, content, findings) if encoding is None else _known(encoding)
-    marked = content.find(codecs.BOM_UTF8, 3) > 0
-
-    def parsed(separator: str) -> Rows:
-        def rows() -> Iterator[list[Row]]:
-            text = io.TextIOWrapper(io.BytesIO(content), encoding=encoding, newline="")
-            lines = (line.replace(MARK, "") for line in text) if marked else text
-            reader = csv.reader(lines, delimiter=separator, skipinitialspace=separator == " ")
-            try:
-                while block := [(reader.line_num, row) for row in islice(reader, CHUNK)]:
-                    yield block
-            except (csv.Error, UnicodeError) as error:
-                raise MampcError(
-                    f"{source}: expected a readable {KIND}, received in row {reader.line_num}: {error}"
-                ) from None
-
-        return rows
-
-    return _row_sheet([(separator, parsed(separator)) for separator in SEPARATORS], names, findings)
-
-
-def _known(encoding: str) -> str:
-    try:
-        return codecs.lookup(encoding).name
-    except (LookupError, TypeError):
-        raise MampcError(f"encoding: expected one such as 'cp932', received {shown(encoding)}") from None
-
-
-def _encoding(path: str | Path, content: bytes, findings: Findings) -> str:
-    """The encoding of a text; raises `MampcError` where it is none."""
-    if content[:4] in (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE):
-        return "utf-32"
-    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return "utf-16"
-    found, zeros = "", content[:2000].count(0)
-    if zeros > len(content[:2000]) / 3:  # two bytes a letter of Latin scripts, without a mark of their order
-        found = "utf-16-be" if content[0] == 0 else "utf-16-le"
-        content = content[:65536].decode(found, "replace").encode("latin-1", "replace")
-    if BINARY.search(content[:65536]):
-        raise MampcError(f"{path}: expected a readable {KIND}, received something else")
-    if found:
-        return found
-    try:
-        for _ in io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig"):
-            pass
-    except UnicodeDecodeError:
-        findings.note(NOT_UTF_8)
-        return "cp1252" if not re.search(rb"[\x81\x8d\x8f\x90\x9d]", content) else "latin-1"
-    return "utf-8-sig"
+    encoding = encoding_of(source, content, encoding, findings)
+    return _row_sheet(
+        [(separator, text_rows(content, encoding, separator, source)) for separator in SEPARATORS],
+        names,
+        findings,
+    )
 
 
 def _row_sheet(

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import product
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
 from mampc.identification.export.date_words import plain_date
-from mampc.identification.export.daytime import DAY, MIDNIGHT, from_midnight, has_midnight
+from mampc.identification.export.daytime import DAY, HOUR, UNDATED, from_midnight
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.sheet import Cells, Sheet
 
@@ -29,22 +30,23 @@ SECONDS = {
 }  # fmt: skip
 DATE_ONLY = re.compile(r"\d+[-/.]\w+[-/.]\d+|\w+ \w+,? \d+")
 OFFSET = re.compile(r".*\d(Z|[+-]\d\d(:?\d\d)?)")
-TIMES = (
-    "", " %H:%M:%S", " %H:%M", " %H:%M:%S.%f", " %I:%M:%S %p", " %I:%M %p", " %I:%M:%S.%f %p", " %H.%M.%S",
-)  # fmt: skip
-DAY_FIRST = (
-    "%d.%m.%Y", "%d/%m/%Y", "%d-%m-%Y", "%d.%m.%y", "%d/%m/%y", "%d-%m-%y",
-    "%d-%b-%Y", "%d-%b-%y", "%d %b %Y", "%d %b %y", "%d/%b/%Y", "%d %B %Y",
-)  # fmt: skip
-MONTH_FIRST = (
-    "%m/%d/%Y", "%m-%d-%Y", "%m/%d/%y", "%m-%d-%y", "%b %d, %Y", "%b %d %Y", "%B %d, %Y",
-)  # fmt: skip
-YEAR_FIRST = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d")
+TIMES = ("", " %H:%M:%S", " %H:%M", " %H:%M:%S.%f", " %I:%M:%S %p", " %I:%M %p", " %I:%M:%S.%f %p")
+# Dates, in each order of day and month that they may have.
+ORDERS = {
+    "day": (
+        "%d.%m.%Y", "%d/%m/%Y", "%d-%m-%Y", "%d.%m.%y", "%d/%m/%y", "%d-%m-%y",
+        "%d-%b-%Y", "%d-%b-%y", "%d %b %Y", "%d %b %y", "%d/%b/%Y", "%d %B %Y",
+    ),
+    "month": ("%m/%d/%Y", "%m-%d-%Y", "%m/%d/%y", "%m-%d-%y", "%b %d %Y", "%B %d %Y"),
+    "year": ("ISO8601", "%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d"),
+}  # fmt: skip
+MOST_FORMATS = 4  # in one column, such as with and without fractions of seconds
 PLAIN = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d{1,6})?)?", re.ASCII)
-SPAN = re.compile(r"\d+ days?,? \d+:\d\d:\d\d(\.\d+)?|(2[4-9]|[3-9]\d|\d{3,}):\d\d:\d\d(\.\d+)?", re.ASCII)
-UTC = re.compile(r" ?(UTC|GMT)$")
+DECIMAL = re.compile(r"(\d),(\d)")
 DIGIT, LETTER = re.compile(r"\d"), re.compile(r"[^\W\d_]")
-HOUR = 3600.0
+NEVER = np.iinfo(np.int64).min  # among ticks, as numpy has it
+
+Ticks = npt.NDArray[np.int64]  # microseconds since 1970, in UTC or in local time
 
 
 @dataclass(frozen=True)
@@ -94,32 +96,120 @@ def plain_stamps(blocks: Iterable[Sequence[Cells]]) -> tuple[Array, datetime] | 
     first = int(ticks.min())
     ticks -= first
     seconds: Array = ticks / 1e6
-    return seconds, datetime(1970, 1, 1) + timedelta(microseconds=first)
+    return seconds, _moment(first)
 
 
-def iso_stamps(blocks: Iterable[Sequence[Cells]]) -> Any:
-    """Stamps in ISO's form as pandas has them, block by block: the words of a long file are never all there.
+def from_stamps(
+    blocks: Iterable[list[str]], how: TimeReading, sheet: Sheet, name: str, findings: Findings
+) -> tuple[Array, Any]:
+    """Seconds after the first stamp, and that stamp.
 
-    None where the cells are no words, or mostly in another form, or some have an offset from UTC and others none.
+    Args:
+        blocks: all cells, some rows at a time: the words of a long file are never all there.
     """
+    zone = (" %z", "%z", "")
+    orders = {
+        order: _Order([f"{day}{time}{end}" for day, time, end in product(days, TIMES, zone)])
+        for order, days in ORDERS.items()
+    }
+    if how.time_format is not None:
+        orders = {"asked for": _Order([how.time_format])}
+    filled = with_offset = 0
+    example, offset = "", ""
+    for cells in blocks:
+        words = [" ".join(cell.split()) for cell in cells]
+        if how.time_format is None:
+            words = [plain_date(word) for word in words]
+            words = [DECIMAL.sub(r"\1.\2", word) if "," in word else word for word in words]
+        offsets = [word for word in words if _has_offset(word)]
+        filled, with_offset = filled + sum(map(bool, words)), with_offset + len(offsets)
+        example, offset = example or words[0], offset or "".join(offsets[:1])
+        words, late = from_midnight(words)
+        for order in orders.values():
+            order.read(words, bool(offsets), late)
+        best = max(order.count for order in orders.values())
+        orders = {key: order for key, order in orders.items() if order.count >= 0.99 * best}
+    if with_offset < 0.9 * filled and offset:
+        findings.doubt(
+            f"some times in column {name!r} have an offset from UTC such as {offset!r}, others have none"
+        )
+    readings = {order: np.concatenate(found.parts) for order, found in orders.items() if found.count}
+    if len(readings) < 2:
+        ticks = next(iter(readings.values()), np.full(len(sheet), NEVER))
+        return since_first(ticks, bool(offset), how, sheet, findings)
+    found = {
+        order: since_first(ticks, bool(offset), how, sheet, Findings(findings.origin))[0]
+        for order, ticks in readings.items()
+    }
+    strays = {order: unevenness(seconds) for order, seconds in found.items()}
+    choice = min(strays, key=lambda order: strays[order])
+    one, other, *_ = found.values()
+    if np.array_equal(one, other, equal_nan=True):
+        findings.note(
+            f"times such as {example!r} may have the day or the month first; the steps are the same"
+        )
+    elif max(strays.values()) < 1.05 * strays[choice] + 0.01:
+        findings.doubt(
+            f"times such as {example!r} in column {name!r} may have the day or the month first; pass their format "
+            "(--time-format '%d/%m/%Y %H:%M:%S')"
+        )
+    else:
+        findings.note(f"times such as {example!r} have the {choice} first: only so are they even")
+    return since_first(readings[choice], bool(offset), how, sheet, findings)
+
+
+class _Order:
+    """Reads stamps with one order of day and month, each in the first of its formats that fits."""
+
+    def __init__(self, formats: Sequence[str]) -> None:
+        self.formats = formats
+        self.fitting: list[str] = []
+        self.strange: set[str] = set()  # patterns of cells that none of the formats fits
+        self.parts: list[Ticks] = []
+        self.count = 0  # of stamps read
+
+    def read(self, words: list[str], utc: bool, late: Any) -> None:
+        """Read some rows; those that are `late` a day later than they say."""
+        import pandas as pd
+
+        ticks = np.full(len(words), NEVER)
+        left = pd.Series(words, dtype=object)
+        left = left[left != ""]
+        tried = 0
+        while len(left) and (tried < len(self.fitting) or self._find(left, utc)):
+            stamps = _parsed(left, self.fitting[tried], utc)
+            stamps = stamps[stamps.notna()]
+            ticks[stamps.index] = ticks_of(stamps)
+            left = left.drop(stamps.index)
+            tried += 1
+        self.count += int(np.count_nonzero(ticks != NEVER))
+        if late is not None:
+            ticks[late & (ticks != NEVER)] += int(DAY * 1e6)
+        self.parts.append(ticks)
+
+    def _find(self, left: Any, utc: bool) -> bool:
+        """Add a format that fits one of the cells; two of each pattern of digits and letters stand for the others."""
+        if len(self.fitting) == MOST_FORMATS:
+            return False
+        kinds: dict[str, list[str]] = {}
+        for cell in left.iloc[:50]:
+            kinds.setdefault(LETTER.sub("a", DIGIT.sub("0", cell)), []).append(cell)
+        for kind in kinds.keys() - self.strange:
+            for cell, form in product({kinds[kind][0], kinds[kind][-1]}, self.formats):
+                if form not in self.fitting and _parsed([cell], form, utc).notna().all():
+                    self.fitting.append(form)
+                    return True
+            self.strange.add(kind)
+        return False
+
+
+def _parsed(words: Any, form: str, utc: bool) -> Any:
     import pandas as pd
 
-    parts: list[Any] = []
-    offsets = None
-    for [cells] in blocks:
-        if not isinstance(cells, list) or has_midnight(cells):
-            return None
-        kinds = {_has_offset(cell) for cell in cells if cell} | ({offsets} - {None})
-        if len(kinds) != 1:
-            return None
-        offsets = kinds.pop()
-        stamps = pd.to_datetime(
-            pd.Series(cells, dtype=object), format="ISO8601", errors="coerce", utc=bool(offsets)
-        )
-        if stamps.notna().mean() < 0.9:
-            return None
-        parts.append(stamps)
-    return pd.concat(parts, ignore_index=True)
+    try:
+        return pd.Series(pd.to_datetime(words, format=form, errors="coerce", utc=utc))
+    except ValueError as error:
+        raise MampcError(f"time_format: expected a format as strptime has it, received {error}") from None
 
 
 def _has_offset(cell: str) -> bool:
@@ -127,132 +217,39 @@ def _has_offset(cell: str) -> bool:
     return signed and OFFSET.fullmatch(cell) is not None and DATE_ONLY.fullmatch(cell) is None
 
 
-def from_stamps(
-    cells: Cells, how: TimeReading, sheet: Sheet, name: str, findings: Findings
+def ticks_of(stamps: Any) -> Ticks:
+    """A pandas Series of stamps, those with a zone in UTC."""
+    if stamps.dt.tz is not None:
+        stamps = stamps.dt.tz_convert("UTC").dt.tz_localize(None)
+    ticks: Ticks = stamps.to_numpy("datetime64[us]").view(np.int64)
+    return ticks
+
+
+def since_first(
+    ticks: Ticks, in_utc: bool, how: TimeReading, sheet: Sheet, findings: Findings
 ) -> tuple[Array, Any]:
-    """Seconds after the first stamp, and that stamp."""
-    words = [UTC.sub("+00:00", " ".join(cell.split())) for cell in cells]
-    if how.time_format is None:
-        words = [plain_date(word) for word in words]
-    offsets = [cell for cell in words if _has_offset(cell)]
-    if offsets and len(offsets) < 0.9 * sum(map(bool, words)):
-        findings.doubt(
-            f"some times in column {name!r} have an offset from UTC such as {offsets[0]!r}, others have none"
-        )
-    words, late = from_midnight(words)
-    readings = list(_readings(words, how, bool(offsets)))
-    if late is not None:
-        readings = [stamps.where(~late, stamps + timedelta(seconds=DAY)) for stamps in readings]
-    best = max(int(stamps.notna().sum()) for stamps in readings)
-    readings = [stamps for stamps in readings if best and stamps.notna().sum() >= 0.99 * best]
-    if not readings:
-        return np.full(len(words), np.nan), None
-    if len(readings) == 1:
-        return since_first(readings[0], how, sheet, findings)
-    found = [since_first(stamps, how, sheet, Findings(findings.origin)) for stamps in readings]
-    choice = 0
-    if not np.array_equal(found[0][0], found[1][0], equal_nan=True):
-        strays = [unevenness(seconds) for seconds, _ in found]
-        choice = int(np.argmin(strays))
-        if max(strays) < 1.05 * min(strays) + 0.01:
-            findings.doubt(
-                f"times such as {words[0]!r} in column {name!r} may have the day or the month first; pass their format "
-                "(--time-format '%d/%m/%Y %H:%M:%S')"
-            )
-        else:
-            order = ("day", "month")[choice]
-            findings.note(f"times such as {words[0]!r} have the {order} first: only so are they even")
-    else:
-        findings.note(
-            f"times such as {words[0]!r} may have the day or the month first; the steps are the same"
-        )
-    return since_first(readings[choice], how, sheet, findings)
-
-
-def _readings(words: list[str], how: TimeReading, offsets: bool) -> Iterator[Any]:
-    """The stamps as pandas reads them, in each order of day and month that they may have."""
-    import pandas as pd
-
-    series = pd.Series(words, dtype=object)
-    if how.time_format is not None:
-        try:
-            yield pd.to_datetime(series, format=how.time_format, errors="coerce", utc=offsets)
-        except ValueError as error:
-            raise MampcError(f"time_format: expected a format as strptime has it, received {error}") from None
-        return
-    points = series
-    if any("," in word for word in words):
-        points = series.str.replace(r"(\d),(\d+)", r"\1.\2", regex=True)
-    iso = pd.to_datetime(points, format="ISO8601", errors="coerce", utc=offsets)
-    if iso.notna().mean() > 0.5:
-        yield iso
-        return
-    zone = (" %z", "%z") if offsets else ("",)
-    for family in (DAY_FIRST, MONTH_FIRST, YEAR_FIRST, ("",)):
-        formats = [
-            (day + time + end).strip() for day, time, end in product(family, TIMES, zone) if day or time
-        ]
-        yield _in_formats(points, formats, offsets)
-
-
-def _in_formats(series: Any, formats: Sequence[str], offsets: bool) -> Any:
-    """Every cell in the first of the formats that reads it."""
-    import pandas as pd
-
-    stamps = pd.to_datetime(pd.Series([None] * len(series), dtype=object), utc=offsets)
-    left = series[series != ""]
-    for _ in range(4):  # such as with and without fractions of seconds, and without a time at midnight
-        fitting = None
-        for cell in _kinds(left.iloc[:50]):
-            fitting = next(
-                (
-                    form
-                    for form in formats
-                    if pd.notna(pd.to_datetime(cell, format=form, errors="coerce", utc=offsets))
-                ),
-                None,
-            )
-            if fitting:
-                break
-        if fitting is None:
-            break
-        read = pd.to_datetime(left, format=fitting, errors="coerce", utc=offsets)
-        stamps = (
-            read.reindex(series.index).combine_first(stamps)
-            if stamps.notna().any()
-            else read.reindex(series.index)
-        )
-        left = left[read.isna()]
-        if not len(left):
-            break
-    return stamps
-
-
-def _kinds(cells: Iterable[str]) -> list[str]:
-    """Two cells of each pattern of digits and letters: others are read as they are."""
-    found: dict[str, list[str]] = {}
-    for cell in cells:
-        found.setdefault(LETTER.sub("a", DIGIT.sub("0", cell)), []).append(cell)
-    return [cell for alike in list(found.values())[:10] for cell in dict.fromkeys((alike[0], alike[-1]))]
-
-
-def since_first(stamps: Any, how: TimeReading, sheet: Sheet, findings: Findings) -> tuple[Array, Any]:
     """Seconds after the earliest stamp, and that stamp, in UTC where it has a zone."""
-    stamps = stamps.reset_index(drop=True)
-    if how.time_zone is not None and getattr(stamps.dtype, "tz", None) is None:
-        stamps = _localised(stamps, how.time_zone, findings)
-    if not stamps.notna().any():
-        return np.full(len(stamps), np.nan), None
-    origin = stamps.min()
-    seconds = (stamps - origin).dt.total_seconds().to_numpy(dtype=np.float64)
-    if origin.tzinfo is None:
-        return clock_put_back(seconds, origin, sheet, findings), origin
-    return seconds, origin.tz_convert("UTC")
+    if how.time_zone is not None and not in_utc:
+        ticks, in_utc = _localised(ticks, how.time_zone, findings), True
+    known = ticks != NEVER
+    if not known.any():
+        return np.full(len(ticks), np.nan), None
+    first = int(ticks[known].min())
+    seconds = np.where(known, (ticks - first) / 1e6, np.nan)
+    if in_utc:
+        return seconds, _moment(first).replace(tzinfo=UTC)
+    return clock_put_back(seconds, _moment(first), sheet, findings), _moment(first)
 
 
-def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
+def _moment(ticks: int) -> datetime:
+    return datetime(1970, 1, 1) + timedelta(microseconds=ticks)
+
+
+def _localised(ticks: Ticks, zone: str, findings: Findings) -> Ticks:
     """Local stamps in their zone; of a doubled hour, the order of rows tells which is which."""
-    known = stamps[stamps.notna()]
+    import pandas as pd
+
+    known = pd.Series(ticks[ticks != NEVER].view("datetime64[us]"))
     steps = known.diff().dt.total_seconds().to_numpy()[1:]
     backwards = bool((steps < 0).sum() > (steps > 0).sum())
     known = known.iloc[::-1] if backwards else known
@@ -261,27 +258,18 @@ def _localised(stamps: Any, zone: str, findings: Findings) -> Any:
     except ValueError as error:
         findings.doubt(f"the doubled hour at the end of summer time in {zone} cannot be told apart: {error}")
         read = known.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
-    return read.reindex(stamps.index)
+    localised = ticks.copy()
+    localised[ticks != NEVER] = ticks_of(read.sort_index())
+    return localised
 
 
-def elapsed(cells: Sequence[str]) -> tuple[str, Array] | None:
-    """A span such as "30:00:00" or "1 days 06:00:00", and all of them in seconds; None where they are times of days."""
-    longest = next((cell for cell in cells if SPAN.fullmatch(cell) and not MIDNIGHT.match(cell)), None)
-    if longest is None:
-        return None
-    import pandas as pd
-
-    spans = pd.to_timedelta(pd.Series(cells, dtype=object), errors="coerce").dt.total_seconds().to_numpy()
-    return (longest, spans.astype(np.float64)) if np.isfinite(spans).mean() > 0.9 else None
-
-
-def clock_put_back(seconds: Array, origin: Any, sheet: Sheet, findings: Findings) -> Array:
+def clock_put_back(seconds: Array, origin: datetime, sheet: Sheet, findings: Findings) -> Array:
     """Local time in the order of rows, with an hour added where the clock was put back an hour."""
     known = np.flatnonzero(~np.isnan(seconds))
     steps = np.diff(seconds[known])
     if (steps < 0).sum() > (steps > 0).sum():  # the newest first
         known, steps = known[::-1], -steps[::-1]
-    if len(steps) < 3 or not (steps > 0).any():
+    if len(steps) < 3 or not (steps > 0).any() or origin.year == UNDATED.year:
         return seconds
     usual = float(np.median(steps[steps > 0]))
     back = np.flatnonzero((np.abs(steps - (usual - HOUR)) <= 0.3 * usual) & (steps <= 0))

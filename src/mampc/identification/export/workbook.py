@@ -29,10 +29,6 @@ def read_workbook(path: Any, content: bytes) -> list[Callable[[], Iterator[list[
         raise MampcError(f"{path}: expected openpyxl to read Excel files: {INSTALL}") from None
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if "[Content_Types].xml" not in archive.namelist():
-                raise MampcError(
-                    f"{path}: expected a readable CSV, Excel or Parquet file, received an archive; unpack it first"
-                )
             if sum(entry.file_size for entry in archive.infolist()) > UNPACKED_LIMIT:
                 raise MampcError(
                     f"{path}: expected an Excel file that unpacks to {UNPACKED_LIMIT / 2**30:g} GiB at most"
