@@ -26,7 +26,7 @@ from seeds import examples
 
 # For tests/test_fuzz.py alone; other tests keep the settings that they state.
 settings.register_profile(
-    "short", max_examples=examples(100, quick=20), stateful_step_count=20, deadline=None, derandomize=True,
+    "short", max_examples=examples(100, quick=12), stateful_step_count=20, deadline=None, derandomize=True,
     phases=[Phase.explicit, Phase.generate],  # shrinking takes many minutes; `make fuzz` does it
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip

@@ -33,7 +33,7 @@ settings = { band = 1e6 }
 @pytest.fixture(scope="module")
 def sweep():
     text = short_study(CONTROLLERS, steps=60, at=(100, 40))
-    return Sweep(parse_study(text), seeds=2, points=4)
+    return Sweep(parse_study(text), seeds=2, points=3)
 
 
 @pytest.fixture(scope="module")

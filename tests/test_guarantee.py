@@ -10,7 +10,7 @@ from builders import random_model
 from referees import counted, keeps_dwell
 from seeds import examples
 
-pytestmark = pytest.mark.usefixtures("either_estimator")
+with_either_estimator = pytest.mark.usefixtures("either_estimator")
 
 STEPS = examples(30, quick=24)
 POLISHED = {name: {"polish": True, "warm_up": 0} if name == "alternating" else {} for name in mampc.METHODS}
@@ -95,12 +95,14 @@ def fullest_window(rules, moves):
     return max(counted(moves[at : at + rules.sparsity_horizon], rules.counting) for at in starts)
 
 
+@with_either_estimator
 @given(loop=loops())
 @settings(max_examples=examples(100, quick=15), deadline=None)
 def test_applied_moves_of_the_exact_method_keep_the_rules(loop):
     assert_keeps_rules(loop[1], loop[0].limits, applied(*loop, "exact"))
 
 
+@with_either_estimator
 @pytest.mark.parametrize("method", [name for name in POLISHED if name != "exact"])
 @given(loop=loops())
 @settings(max_examples=examples(20, quick=3), deadline=None)
@@ -122,6 +124,7 @@ def test_the_budget_is_spent_and_dwell_times_end(method):
     assert any((np.diff(np.flatnonzero(of_input)) == 4).any() for of_input in moves.T)
 
 
+@with_either_estimator
 @pytest.mark.parametrize("method", POLISHED)
 @pytest.mark.parametrize("counting", ["elementwise", "simultaneous"])
 def test_after_manual_operation_no_move_is_made_until_the_window_has_room(method, counting):

@@ -10,7 +10,7 @@ import mampc
 from builders import random_model
 from mampc import Remark, Status
 from referees import best_on, keeps_rules, keeps_timings, moved, objective_of, program_of, scip_on_levels
-from seeds import examples, seeds
+from seeds import deep, examples, seeds
 
 METHODS = {name: {"polish": True} if name == "alternating" else {} for name in mampc.METHODS}
 
@@ -180,7 +180,7 @@ def test_no_course_of_an_on_off_valve_is_better(timed, seed):
 
 
 @pytest.mark.parametrize(
-    "levels", [[0.0, 10.0], [0.0, 4.0, 10.0], list(range(0, 11, examples(1, quick=2)))], ids=len
+    "levels", [[0.0, 10.0], list(range(0, 11, examples(1, quick=2))), *deep([0.0, 4.0, 10.0])], ids=len
 )
 @pytest.mark.parametrize("rules", [{}, {"price": 0.1}, {"max_moves": 3}, {"price": 0.1, "dwell": 2}], ids=str)
 def test_scip_finds_nothing_better(levels, rules):
