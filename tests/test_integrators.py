@@ -5,7 +5,7 @@ import pytest
 
 import mampc
 from mampc import IOData, StateSpace, n4sid, prbs
-from mampc.study.own import draft
+from mampc.study.draft import draft
 from mampc.systems.properties import properties
 from seeds import deep, examples, seeds
 

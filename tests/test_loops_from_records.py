@@ -5,7 +5,7 @@ import pytest
 
 import mampc
 from mampc.controllers.offset import LEFT
-from mampc.study.own import draft
+from mampc.study.draft import draft
 from mampc.systems.properties import properties
 from seeds import seeds
 

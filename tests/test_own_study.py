@@ -14,7 +14,8 @@ from mampc import StateSpace
 from mampc.cli import app
 from mampc.program.condensing import CondensedQP
 from mampc.study import load_study, parse_study, template
-from mampc.study.own import draft, own_study
+from mampc.study.draft import draft
+from mampc.study.own import own_study
 from mampc.study.running import run_study
 from mampc.systems.evidence import Evidence
 from mampc.systems.noise import Noise
