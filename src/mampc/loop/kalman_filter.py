@@ -173,8 +173,6 @@ class KalmanFilter(Estimator):
         if not is_usable(known):
             return None
         data = self.map.dot(known)
-        if not is_usable(data):
-            return None
         x, at_outputs, at_inputs, innovation, movement = self._parts
         return Updated(Estimate(data[x], data[at_outputs], data[at_inputs]), data[innovation], data[movement])
 

@@ -35,7 +35,7 @@ from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
 from mampc.loop.kalman_filter import KalmanFilter
-from mampc.loop.mixing import NOISE_RANGE, BankEstimate, Filters, Mixing, filters_of, together
+from mampc.loop.mixing import NOISE_RANGE, BankEstimate, Filters, Mixing, filters_of
 from mampc.program.problem import TrackingProblem
 from mampc.systems.noise import white_noise
 from mampc.systems.state_space import StateSpace, as_discrete
@@ -86,7 +86,6 @@ class LoadBank(Estimator):
         if (sizes <= 0).any():
             raise MampcError(f"noise: expected positive numbers, received {sizes}")
         self._told = NOISE_GUESSED if as_flag("guessed", guessed) else NOISE_TOLD
-        self._doubting = NOISE_RANGE[0] if guessed else 1.0
         self.model, self.noise, self.hypotheses = model, sizes, tuple(hypotheses)
         self.loads = Loads.of(model, sizes)
         try:
@@ -96,8 +95,8 @@ class LoadBank(Estimator):
             raise MampcError(f"LoadBank: {error}") from None
         self._kept = tuple(sorted({h.kept for h in self.hypotheses if h.kept > 0}))
         self._planning_model = self.loads.with_fading(self._kept) if self._kept else model
-        self._mixing = Mixing(np.array([h.load is LoadKind.JUMPS for h in self.hypotheses]))
-        self._per_output, self._of_all = np.ones(model.n_outputs), np.ones(len(self.members))
+        jumps = np.array([h.load is LoadKind.JUMPS for h in self.hypotheses])
+        self._mixing = Mixing(jumps, NOISE_RANGE[0] if guessed else 1.0)
         self._A = np.stack([member.A for member in self.members])
         self._C = np.stack([member.C for member in self.members])
         self._plans = np.stack([self.to_plan(b) for b in range(len(self.members))])
@@ -108,13 +107,19 @@ class LoadBank(Estimator):
         same, fading = np.eye(model.n_states + l + m), self._planning_model.n_states - model.n_states
         x, d_y, d_u = np.split(same, np.cumsum([model.n_states, l]), axis=1)
         self._plain_part = np.hstack([x, np.zeros((len(same), fading)), d_u, d_y])
+        self._of_each = np.kron(np.eye(len(self._A)), np.ones(l))  # sums up what belongs to each hypothesis
         self._filters: dict[bytes, Filters] = {}
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
         self._of_late, self._moved = moves_of_late(model), slice(model.n_states, model.n_states + l)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
-        self._of_states, self._of_known, self._beside = self._everyday()
-        self._together = together(self._of_states, self._of_known, self._beside)
+        # The members' models differ in how s goes on: all may have the same A once their mixed z are multiplied by
+        # `_begins` before, and by `_goes_on` after.
+        kept = np.array([h.kept for h in self.hypotheses])[:, None]
+        lasting = np.ones((len(kept), model.n_states + self.loads.count))
+        self._begins = np.hstack([lasting, np.repeat(kept > 0, self.loads.count, axis=1)])
+        self._goes_on = np.hstack([lasting, np.repeat(kept, self.loads.count, axis=1)])
+        self._of_mixed, self._of_known = self._everyday()
 
     @classmethod
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
@@ -177,8 +182,8 @@ class LoadBank(Estimator):
         members[:, n : n + k] = loads[int(stuck.argmax()), :k]
         members[:, n + k :] = 0.0
         plain = _flat(self.plain.with_loads(self._plain_of(bank), stuck, loads[:, k:]))
-        trust = self._trust(bank.late, bank.scale, self._everything)
-        return self._estimate(members, bank.weights, bank.usual, bank.scale, bank.late, plain, trust)
+        counts = self._counts(bank.weights, bank.late, bank.scale)
+        return self._estimate(members, bank.weights, bank.usual, bank.scale, bank.late, plain, counts)
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
         """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
@@ -193,74 +198,68 @@ class LoadBank(Estimator):
         scale = np.array([1.0, self._told])
         plain = _flat(self.plain.initial(u, y, v))
         chances = usual @ self._mixing.chances
-        return self._estimate(members, chances, usual, scale, late, plain, np.ones(len(usual)))
+        return self._estimate(members, chances, usual, scale, late, plain, 1.0)
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
-        bank, l = _bank(last), len(y)
-        c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
-        known = np.concatenate((mixed.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain))
-        beside = len(self._beside)
+        bank, l, n_z = _bank(last), len(y), len(self._of_mixed)
+        known = np.concatenate((bank.members.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain))
         if not is_usable(known):
             return None
-        if self._together is None:
-            own = self._of_known.dot(known[mixed.size : mixed.size + self._of_known.shape[1]])
-            own += np.matmul(self._of_states, mixed[:, :, None]).ravel()
-            each = np.concatenate((own, self._beside.dot(known[mixed.size :])))
-        else:
-            each = self._together.dot(known)
-        if not is_usable(each):
-            return None
-        late, plain = each[-beside : -len(bank.plain)], each[-len(bank.plain) :]
-        each = each[:-beside].reshape(len(c), -1)
-        seen = c.dot(each[:, 2 * mixed.shape[1] : -l])  # innovation and movement of the mixture
-        estimate = self._weighed(*self._split(each), late, plain, c, bank, self._everything)
+        c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
+        mixed *= self._begins
+        told, each = self._of_known.dot(known[mixed.size :]), mixed.dot(self._of_mixed)
+        each += told[: n_z + 2 * l]
+        seen = c.dot(each[:, n_z:])  # innovation and movement of the mixture
+        estimate = self._weighed(
+            each[:, :n_z] * self._goes_on, each[:, n_z : n_z + l].ravel(),
+            told[n_z + 2 * l : -len(bank.plain)], told[-len(bank.plain) :], c, bank, self._everything,
+        )  # fmt: skip
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
         """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
-        bank = _bank(last)
+        bank, l, n_z, filters = _bank(last), y.shape[1], len(self._of_mixed), self._everything
         known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1)), bank.late, bank.plain), axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
             c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
-            n_z, l = mixed.shape[2], y.shape[1]
-            late, plain = np.split(known @ self._beside.T, [bank.late.shape[1]], axis=1)
-            each = np.matmul(self._of_states, mixed[..., None])[..., 0]
-            each += (known[:, : self._of_known.shape[1]] @ self._of_known.T).reshape(each.shape)
-            seen = np.einsum("sb,sbi->si", c, each[:, :, 2 * n_z : -l])
-            estimate = self._weighed(*self._split(each), late, plain, c, bank, self._everything)
+            told = known @ self._of_known.T
+            each, late, plain = np.split(told, [n_z + 2 * l, -len(bank.plain.T)], axis=1)
+            each = (mixed * self._begins) @ self._of_mixed + each[:, None]
+            seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:])
+            innovations = each[:, :, n_z : n_z + l].reshape(len(y), -1)
+            surprise = np.square(innovations @ filters.whiten.T) @ self._of_each.T
+            moved = np.square(late[:, self._moved]) @ filters.precisions.T
+            trust, weights, usual, scale = self._mixing.many(
+                c, surprise, moved, filters, bank.usual, bank.scale
+            )
+            correction = (innovations @ filters.gains.T).reshape(mixed.shape)
+            members = each[:, :, :n_z] * self._goes_on + trust[..., None] * correction
+            counts = (weights * trust).sum(axis=1, keepdims=True)
+            estimate = self._estimate(members, weights, usual, scale, late, plain, counts)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
-    def _split(self, each: Array) -> tuple[Array, Array, Array]:
-        """Of all that `_everyday` gives: z predicted, its correction, and the innovation made white."""
-        n_z, l = self._A.shape[1], self.model.n_outputs
-        return each[..., :n_z], each[..., n_z : 2 * n_z], each[..., -l:]
+    def _everyday(self) -> tuple[Array, Array]:
+        """What `update` needs of a mixed z and of all else that is known, (u, v_last, v, y, 1, late, plain).
 
-    def _everyday(self) -> tuple[Array, Array, Array]:
-        """Maps of a mixed z (B, n + 2k) and of (u, v_last, v, y, 1) to all that `update` needs of each hypothesis.
-
-        That is z predicted, its correction, innovation, movement of the outputs, innovation made white.
-        And the map of (u, v_last, v, y, 1, late, plain) to the next `late` and `plain`.
+        The map from z, transposed, is the same for all hypotheses: to z predicted, innovation and movement of the
+        outputs. That of the known has the same rows, and below them the next `late` and `plain`.
         """
-        model = self.model
+        model, k = self.model, self.loads.count
         n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
         sizes = (m, d, d, l, 1, len(self._of_late), n + l + m)
         u, v_last, v, y, one, late, plain = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
         op = np.outer(model.all_inputs_op, one)
         drive = model.B @ (np.vstack([u, v_last]) - op)
         surplus = y - np.outer(model.y_op, one) - model.D @ (np.vstack([u, v]) - op)
-        of_states, of_known = [], []
-        filters = self.filters(self._all)
-        for A, C, K, W in zip(self._A, self._C, filters.gains, filters.whiten, strict=True):
-            driven = np.vstack([drive, np.zeros((len(A) - n, drive.shape[1]))])
-            moved = model.C @ (A[:n] - np.eye(n, len(A)))
-            innovation = surplus - C @ driven
-            seen = -C @ A
-            of_states.append(np.vstack([A, K @ seen, seen, moved, W @ seen]))
-            of_known.append(np.vstack([driven, K @ innovation, innovation, model.C @ drive, W @ innovation]))
+        A, C = self._A[0].copy(), self._C[0]
+        A[n : n + k, n + k :] = A[n + k :, n + k :] = np.eye(k)
+        of_z = np.vstack([A, -C @ A, model.C @ (A[:n] - np.eye(n, len(A)))])
+        driven = np.vstack([drive, np.zeros((2 * k, drive.shape[1]))])
         of_plain = self.plain.map[: n + l + m] @ np.vstack([plain, u, v_last, v, y, one])
-        beside = np.vstack([self._of_late @ np.vstack([late, u]), of_plain])
-        return np.stack(of_states), np.vstack(of_known)[:, : sum(sizes[:5])].copy(), beside
+        of_late = self._of_late @ np.vstack([late, u])
+        of_known = np.vstack([driven, surplus - C @ driven, model.C @ drive, of_late, of_plain])
+        return np.ascontiguousarray(of_z.T), of_known
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since."""
@@ -270,8 +269,8 @@ class LoadBank(Estimator):
         members[:, : model.n_states] += model.B @ self._change(u, v)
         late = self._of_late.dot(np.concatenate((bank.late, u)))
         plain = _flat(self.plain.predict(self._plain_of(bank), u, v))
-        trust = self._trust(late, bank.scale, self._everything)
-        return self._estimate(members, c, bank.usual, bank.scale, late, plain, trust)
+        counts = self._counts(c, late, bank.scale)
+        return self._estimate(members, c, bank.usual, bank.scale, late, plain, counts)
 
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
         """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
@@ -288,15 +287,11 @@ class LoadBank(Estimator):
         seen, filters = self._seen(bank.members), self.filters(believed)
         innovation = np.where(believed, innovation, 0.0)
         each = innovation + bank.weights @ seen - seen
-        correction = np.matmul(filters.gains, each[:, :, None])[:, :, 0]
-        white = np.matmul(filters.whiten, each[:, :, None])[:, :, 0]
         plain, model = self._plain_of(bank), self.model
         seen_beside = bank.weights @ seen + self.plain.innovation(plain, model.u_op, model.y_op)
         off = np.where(believed, innovation + seen_beside, 0.0)
         corrected = _flat(self.plain.corrected(plain, off, believed))
-        return self._weighed(
-            bank.members, correction, white, bank.late, corrected, bank.weights, bank, filters
-        )
+        return self._weighed(bank.members, each.ravel(), bank.late, corrected, bank.weights, bank, filters)
 
     def filters(self, believed: BoolArray) -> Filters:
         """The gains where only some outputs, bool (l,), are believed."""
@@ -309,8 +304,7 @@ class LoadBank(Estimator):
     def _weighed(
         self,
         members: Array,
-        correction: Array,
-        white: Array,
+        innovations: Array,
         late: Array,
         plain: Array,
         c: Array,
@@ -320,32 +314,23 @@ class LoadBank(Estimator):
         """The estimate after Bayes' rule.
 
         Args:
-            members, correction: predicted, and what innovations alone would add to them, shape (..., B, n + 2k).
-            white: innovations made white, shape (..., B, l).
+            members: predicted, shape (B, n + 2k).
+            innovations: of one hypothesis after the other, shape (B l,).
             late, plain: of the estimate, predicted, and the latter corrected.
-            c: how likely each hypothesis was before, shape (..., B).
+            c: how likely each hypothesis was before, shape (B,).
         """
-        surprise = np.square(white).dot(self._per_output)
-        # Without any output the inputs' moves are as doubtful as they were with all.
-        trust = self._trust(late, bank.scale, filters if filters.believed else self._everything)
-        surprise *= trust
-        log_scale = filters.log_scale + 0.5 * filters.believed * np.log(trust)
-        after = self._mixing.one if late.ndim == 1 else self._mixing.many
-        return self._estimate(
-            members + trust[..., None] * correction,
-            *after(c, surprise, log_scale, filters.believed, bank.usual, bank.scale),
-            late,
-            plain,
-            trust,
-        )
+        surprise = self._of_each.dot(np.square(filters.whiten.dot(innovations)))
+        moved = filters.precisions.dot(np.square(late[self._moved]))
+        trust, weights, usual, scale = self._mixing.one(c, surprise, moved, filters, bank.usual, bank.scale)
+        correction = filters.gains.dot(innovations).reshape(members.shape)
+        correction *= trust[:, None]
+        correction += members
+        return self._estimate(correction, weights, usual, scale, late, plain, weights.dot(trust))
 
-    def _trust(self, late: Array, scale: Array, filters: Filters) -> Array:
-        """t of every hypothesis beside what the inputs' last moves did, shape (..., B)."""
-        h = np.square(late[..., self._moved])
-        moved = filters.precisions.dot(h) if h.ndim == 1 else h @ filters.precisions.T
-        noise = filters.believed * np.minimum(scale[..., :1], self._doubting)
-        trust: Array = 1 / (1 + moved / noise)
-        return trust
+    def _counts(self, weights: Array, late: Array, scale: Array) -> float:
+        """t of the bank, with every output believed."""
+        moved = self._everything.precisions.dot(np.square(late[self._moved]))
+        return float(weights.dot(self._mixing.trust(moved, scale)))
 
     def _estimate(
         self,
@@ -355,11 +340,12 @@ class LoadBank(Estimator):
         scale: Array,
         late: Array,
         plain: Array,
-        trust: Array,
+        counts: Any,
     ) -> BankEstimate:
-        t = (weights * trust).dot(self._of_all)[..., None]
-        plan = t * (weights[..., None] * members).reshape((*weights.shape[:-1], -1)).dot(self._mixture)
-        plan = plan + (1 - t) * plain.dot(self._plain_part)
+        """The estimate whose plans count on the bank with the weight t, `counts`, and else on the plain filter."""
+        each = (weights[..., None] * members).reshape((*weights.shape[:-1], -1))
+        plan = plain.dot(self._plain_part)
+        plan += counts * (each.dot(self._mixture) - plan)
         x, at_inputs, at_outputs = self._parts
         return BankEstimate(
             plan[..., x],

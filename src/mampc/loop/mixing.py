@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from mampc.base.checks import Array, BoolArray
 from mampc.loop.estimator import Estimate
@@ -25,7 +26,6 @@ LEAST = 1e-6  # share of samples in which each hypothesis usually holds at least
 NOISE_REMEMBERED = 100.0  # and of what is seen of it
 NOISE_RANGE = (0.01, 100.0)  # of the variance, beside what was told
 UNUSUAL = 9.0  # times the variance: no innovation counts for more in it
-SMALL = 30_000  # numbers in a matrix: up to this, one product with many zeros is quicker than several without
 IMPOSSIBLE = 1e-300  # no hypothesis is less likely, so that some are left whatever comes
 
 
@@ -56,11 +56,13 @@ class BankEstimate(Estimate):
 class Filters(NamedTuple):
     """The gains of all hypotheses where some outputs are believed, and what measures their innovations.
 
+    Vectors of all hypotheses, one behind the other, have shape (B l,) where each has (l,), and so on.
+
     Attributes:
-        gains: shape (B, n + 2k, l).
-        whiten: W with |W e|^2 = e' S^-1 e, shape (B, l, l).
-        precisions: the diagonals of S^-1, shape (B, l).
-        log_scale: -1/2 log det S, shape (B,).
+        gains: from their innovations to what these add to their z, shape (B (n + 2k), B l).
+        whiten: from their innovations to W e of each, with |W e|^2 = e' S^-1 e, shape (B l, B l).
+        precisions: the diagonals of S^-1 over how many outputs are believed, shape (B, l); of all where none is.
+        log_scale: -1/2 log det S of each, shape (B,).
         believed: how many outputs are.
     """
 
@@ -73,14 +75,18 @@ class Filters(NamedTuple):
 
 def filters_of(members: Sequence[Member], noise: Array, believed: BoolArray) -> Filters:
     """Those of members with noise (l,) in their outputs, where only some of these, bool (l,), are believed."""
-    whiten = np.zeros((len(members), len(believed), len(believed)))
-    log_scale = np.zeros(len(members))
-    for b, member in enumerate(members):
+    whiten, log_scale = [], []
+    for member in members:
         root = np.linalg.cholesky(member.innovation_covariance(believed))
-        whiten[b][np.ix_(believed, believed)] = np.linalg.inv(root)
-        log_scale[b] = -np.log(np.diag(root) / noise[believed]).sum()
-    gains = np.stack([member.gain(believed) for member in members])
-    return Filters(gains, whiten, np.square(whiten).sum(axis=1), log_scale, int(believed.sum()))
+        whiten.append(np.zeros((len(believed), len(believed))))
+        whiten[-1][np.ix_(believed, believed)] = np.linalg.inv(root)
+        log_scale.append(-np.log(np.diag(root) / noise[believed]).sum())
+    gains, count = [member.gain(believed) for member in members], int(believed.sum())
+    # Without any output the inputs' moves are as doubtful as they were with all.
+    doubtful = (
+        np.square(whiten).sum(axis=1) / count if count else filters_of(members, noise, ~believed).precisions
+    )
+    return Filters(block_diag(*gains), block_diag(*whiten), doubtful, np.array(log_scale), count)
 
 
 class Mixing:
@@ -88,67 +94,81 @@ class Mixing:
 
     Args:
         jumps: which hypotheses say that the load has just jumped, shape (B,).
+        doubting: up to which factor of the noise, beside what was told, it makes moves of the inputs less doubtful.
 
     Attributes:
         chances: T as far as it does not depend on what usually holds, shape (B, B).
         lasts: 1 for hypotheses that may hold usually, 0 for jumps, shape (B,).
     """
 
-    def __init__(self, jumps: BoolArray) -> None:
+    def __init__(self, jumps: BoolArray, doubting: float = 1.0) -> None:
         self.chances, returns = _chances(jumps)
         self.lasts = np.where(jumps & ~jumps.all(), 0.0, 1.0)
         self._returns, self._ones = returns[:, None], np.ones(len(jumps))
-        self._least, self._remembered = LEAST * self.lasts, FORGETS * self.lasts
+        self._all, self._impossible = np.ones((len(jumps), len(jumps))), np.full(len(jumps), IMPOSSIBLE)
+        self._kept, self._remembered = (1 - FORGETS) * self._ones, FORGETS * self.lasts
+        self._least, self._doubting = LEAST * self.lasts, doubting
 
     def before(self, weights: Array, usual: Array, members: Array) -> tuple[Array, Array]:
         """How likely each hypothesis is now, before the measurement, (..., B); and where its filter starts."""
-        joint = weights[..., None] * (self.chances + self._returns * usual[..., None, :])
-        if joint.ndim == 2:  # one loop: `dot` takes half the time of `matmul` here
-            c = np.maximum(self._ones.dot(joint), IMPOSSIBLE)
-            return c, joint.T.dot(members) / c[:, None]
+        chances = self._returns * usual[..., None, :]
+        chances += self.chances
+        if usual.ndim == 1:  # one loop: `dot` takes half the time of `matmul` here
+            c = np.maximum(weights.dot(chances), self._impossible)
+            return c, (chances.T * weights).dot(members) / c[:, None]
+        joint = weights[..., None] * chances
         c = np.maximum(self._ones @ joint, IMPOSSIBLE)
         return c, np.matmul(joint.swapaxes(-1, -2), members) / c[..., None]
 
+    def trust(self, moved: Array, scale: Array) -> Array:
+        """t of every hypothesis, shape (..., B), given h' diag(S^-1) h / l, of that shape, and the scale (..., 2)."""
+        trust: Array = 1 / (1 + moved / np.minimum(scale[..., :1], self._doubting))
+        return trust
+
     def many(
-        self, c: Array, surprise: Array, log_scale: Array, believed: int, usual: Array, scale: Array
-    ) -> tuple[Array, Array, Array]:
-        """Weights, usual ones and scale of many loops after their innovations.
+        self, c: Array, surprise: Array, moved: Array, filters: Filters, usual: Array, scale: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Trust, weights, usual ones and scale of many loops after their innovations.
 
         Args:
             c: of `before`.
             surprise: e' S^-1 e of each hypothesis, shape (S, B).
-            log_scale: -1/2 log det S, shape (S, B).
-            believed: how many outputs are.
+            moved: h' diag(S^-1) h / l of each, shape (S, B).
+            filters: of the outputs believed, at least one.
             usual, scale: at the last sample, shapes (S, B) and (S, 2).
         """
-        likelihood = log_scale - 0.5 * surprise / scale[:, :1]
+        trust, believed = self.trust(moved, scale), filters.believed
+        surprise = surprise * trust
+        likelihood = filters.log_scale + 0.5 * believed * np.log(trust) - 0.5 * surprise / scale[:, :1]
         weights = c * np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
         weights /= weights.dot(self._ones)[:, None]
         usual = np.maximum((1 - FORGETS) * usual + FORGETS * weights, LEAST) * self.lasts
         usual /= usual.dot(self._ones)[:, None]
-        if not believed:
-            return weights, usual, scale
         shown = np.einsum("sb,sb->s", weights, surprise) / believed
         variance, seen = scale[:, 0], np.minimum(scale[:, 1] + 1, NOISE_REMEMBERED)
         variance = variance + (np.minimum(shown, UNUSUAL * variance) - variance) / seen
-        return weights, usual, np.stack([np.clip(variance, *NOISE_RANGE), seen], axis=1)
+        return trust, weights, usual, np.stack([np.clip(variance, *NOISE_RANGE), seen], axis=1)
 
     def one(
-        self, c: Array, surprise: Array, log_scale: Array, believed: int, usual: Array, scale: Array
-    ) -> tuple[Array, Array, Array]:
-        """The same of one loop, shapes (B,), in as few calls as a handful of numbers allow."""
-        variance, samples = scale.tolist()
-        likelihood = log_scale - surprise * (0.5 / variance)
+        self, c: Array, surprise: Array, moved: Array, filters: Filters, usual: Array, scale: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """The same of one loop, in as few calls as a handful of numbers allow."""
+        believed, (variance, samples) = filters.believed, scale.tolist()
+        doubt = moved / min(variance, self._doubting)
+        trust = self._ones / (self._ones + doubt)
+        surprise = surprise * trust
+        likelihood = filters.log_scale - np.log1p(doubt) * (0.5 * believed) - surprise * (0.5 / variance)
         weights = c * np.exp(likelihood - likelihood[likelihood.argmax()])
-        weights *= 1 / weights.dot(self._ones)
-        usual = np.maximum(usual * (1 - FORGETS) + weights * self._remembered, self._least)
-        usual *= 1 / usual.dot(self._ones)
+        weights /= self._all.dot(weights)
+        usual = np.maximum(usual * self._kept + weights * self._remembered, self._least)
+        usual /= self._all.dot(usual)
         if not believed:
-            return weights, usual, scale
+            return trust, weights, usual, scale
         shown = float(weights.dot(surprise)) / believed
         samples = min(samples + 1, NOISE_REMEMBERED)
         variance += (min(shown, UNUSUAL * variance) - variance) / samples
-        return weights, usual, np.array((min(max(variance, NOISE_RANGE[0]), NOISE_RANGE[1]), samples))
+        variance = min(max(variance, NOISE_RANGE[0]), NOISE_RANGE[1])
+        return trust, weights, usual, np.array((variance, samples))
 
 
 def _chances(jumps: BoolArray) -> tuple[Array, Array]:
@@ -166,19 +186,3 @@ def _shared(places: BoolArray) -> Array:
     """Every row's chance of one, shared by its places; zeros in rows without any."""
     count: Array = places.sum(axis=1, keepdims=True).astype(np.float64)
     return places / np.maximum(count, 1.0)
-
-
-def together(blocks: Array, of_known: Array, beside: Array) -> Array | None:
-    """One matrix: blocks (B, rows, columns) along its diagonal, behind them what is known to the same rows.
-
-    Below are further rows, of what is known alone, which is more for these. None if the matrix is not small.
-    """
-    (count, rows, columns), height = blocks.shape, len(of_known) + len(beside)
-    if height * count * columns > SMALL:
-        return None
-    matrix = np.zeros((height, count * columns + beside.shape[1]))
-    for b, block in enumerate(blocks):
-        matrix[b * rows : (b + 1) * rows, b * columns : (b + 1) * columns] = block
-    matrix[: len(of_known), count * columns : count * columns + of_known.shape[1]] = of_known
-    matrix[len(of_known) :, count * columns :] = beside
-    return matrix
