@@ -128,6 +128,20 @@ def test_limits_that_contradict_one_another_hold_the_inputs_and_spoil_nothing(me
     assert after.objective == before.objective
 
 
+def test_an_input_whose_limits_contradict_one_another_leaves_the_others_within_theirs():
+    problem = tank_problem(identified_tank())
+    controller = mampc.MPC(problem)
+    state = controller.initial_state([50.0, 70.0])
+    limits = mampc.Limits(u_min=[60.0, 0.0], u_max=[40.0, 65.0])
+    held = controller.step(state, np.zeros(4), problem.model.y_op, limits=limits)
+    assert held.status is Status.HELD_INFEASIBLE
+    np.testing.assert_array_equal(held.u, [50.0, 65.0])
+    manual = controller.step(state, np.zeros(4), problem.model.y_op, limits=limits, manual=[True, False])
+    assert not manual.held
+    assert (manual.plan[:, 0] == 50.0).all()
+    assert (manual.plan[:, 1] <= 65.0).all()
+
+
 def test_limits_that_are_no_numbers_stay_as_the_problem_has_them():
     controller = mampc.MPC(tank_problem())
     state, r = controller.initial_state(), controller.problem.model.y_op + 60.0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import mampc
+from builders import tank_model, tank_problem
 from test_rivals import UNIT, double_integrator
 
 
@@ -71,3 +72,18 @@ def test_the_norm_of_self_triggered_control_falls_by_its_rate_under_the_lq_law_w
     for _ in range(30):
         before, z = np.abs(law.P @ z).max(axis=0), (law.A - law.B @ law.K) @ z
         assert (np.abs(law.P @ z).max(axis=0) <= law.rho * before * (1 + 1e-6)).all()
+
+
+def test_self_triggered_control_keeps_limits_of_moves_told_at_run_time():
+    model = tank_model()
+    problem = tank_problem(model, limits=mampc.Limits(u_min=0.0, u_max=100.0, du_max=20.0))
+    controller, x = mampc.rivals.SelfTriggered(mampc.MPC(problem)), np.zeros(4)
+    state, u, moved = controller.initial_state(), model.u_op, 0.0
+    for k in range(20):
+        du_max = 0.5 if k % 2 else 3.0
+        reference = model.y_op + 4.0 * (-1) ** (k // 5)
+        decision = controller.step(state, x, reference, limits=mampc.Limits(du_max=du_max))
+        assert (np.abs(decision.u - u) <= du_max + 1e-9).all()
+        moved, x = moved + np.abs(decision.u - u).sum(), model.A @ x + model.B @ (decision.u - model.u_op)
+        state, u = decision.state, decision.u
+    assert moved > 1.0

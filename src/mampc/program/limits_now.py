@@ -127,10 +127,10 @@ class LimitsNow:
     replace those of the problem. What is None or not a number stays as the problem has it.
 
     Attributes:
-        inputs: the range of the inputs; that of the problem where the limits cross.
+        inputs: the range of the inputs; that of the problem for inputs whose limits cross.
         du_max: shape (nc, m).
         y_min, y_max: at i = 1..np, shape (np, l).
-        crossed: whether some u_min is above its u_max, so that no input can keep both.
+        crossed: whether some u_min of an input that is not in manual is above its u_max, so that it cannot keep both.
 
     Raises:
         MampcError: the wrong shape, or limits of signals for which the problem has none.
@@ -154,10 +154,15 @@ class LimitsNow:
         self._condensed = condensed
         u_min = np.maximum(given("u_min", n_c), np.maximum(usual.u_min, -LARGEST / 2))
         u_max = np.minimum(given("u_max", n_c), np.minimum(usual.u_max, LARGEST / 2))
-        self.crossed = bool((u_min > u_max).any())
-        self.inputs = InputRange(u_min, u_max, levels=levels)
+        self._crossing = (u_min > u_max).any(axis=0)
+        self.crossed = bool(self._crossing.any())
         if self.crossed:
-            self.inputs = UsualLimits(condensed, levels).inputs
+            whole = UsualLimits(condensed).inputs
+            u_min, u_max = (
+                np.where(self._crossing, usual_end, end)
+                for usual_end, end in ((whole.low, u_min), (whole.high, u_max))
+            )
+        self.inputs = InputRange(u_min, u_max, levels=levels)
         self.du_max = np.clip(given("du_max", n_c), 0.0, usual.du_max)
         # Beyond what counts as a number a limit is as good as none, or as one that nothing can keep.
         self.y_min = np.minimum(given("y_min", n_p), LARGEST)
@@ -166,6 +171,7 @@ class LimitsNow:
     def with_manual(self, manual: BoolArray, u: Array) -> LimitsNow:
         """The limits with inputs in manual, shape (m,), left alone where u, shape (m,), is beyond them."""
         self.inputs = self.inputs.leaving(manual, u)
+        self.crossed = bool((self._crossing & ~manual).any())
         return self
 
     def applied_to(self, sample: Sample) -> Sample:

@@ -79,7 +79,7 @@ class SelfTriggered(Rule):
             plan = self._only(np.zeros(m), Plan(None, Status.FEASIBLE, 0))
             return plan._replace(memory=np.concatenate([[memory[0] - 1], memory[1:]]))
         error = np.concatenate([p[self.condensed.parameter.x] - steady.x, (u - steady.u) / self._law.unit])
-        held, move = self._longest_hold(error, u)
+        held, move = self._longest_hold(error, *self._first_moves(sample))
         if move is None or sample.frozen is not None:
             plan = self.controller.plan(sample, state)
             if plan.moves is None:
@@ -89,9 +89,20 @@ class SelfTriggered(Rule):
             plan = self._only(self._law.unit * move, Plan(None, Status.FEASIBLE, held))
         return plan._replace(memory=np.concatenate([[max(held, 1) - 1], reference]))
 
-    def _longest_hold(self, error: Array, u: Array) -> tuple[int, Array | None]:
-        """h, and the move (m,), in units, that keeps the decay for so long: none if the applied inputs u do."""
-        size, none = float(np.abs(self._law.P @ error).max()), np.zeros(len(u))
+    def _first_moves(self, sample: Sample) -> tuple[Array, Array]:
+        """The least and the largest move of each input at this sample, shape (m,)."""
+        bounds, m = self.condensed.bounds, len(sample.u_previous)
+        v, rows = bounds.n_violations, bounds.input_rows
+        low, high = sample.lower[v : v + m].copy(), sample.upper[v : v + m].copy()
+        moved = bounds.move_of_bound[rows]
+        first = moved < m
+        low[moved[first]] = np.maximum(low[moved[first]], sample.lower[rows][first])
+        high[moved[first]] = np.minimum(high[moved[first]], sample.upper[rows][first])
+        return low, high
+
+    def _longest_hold(self, error: Array, least: Array, most: Array) -> tuple[int, Array | None]:
+        """h, and the move (m,), in units, that keeps the decay for so long: none if holding does."""
+        size, none = float(np.abs(self._law.P @ error).max()), np.zeros(len(least))
         reach = np.abs(self._forced).max()
         if size <= NEAR * max(reach, 1e-300):
             return self._longest, none
@@ -105,22 +116,23 @@ class SelfTriggered(Rule):
         found: Array | None = none if low else None
         while low < high:
             middle = (low + high + 1) // 2
-            move = self._program(error, drift[:middle], np.append(level[: middle - 1], end[middle - 1]), u)
+            levels = np.append(level[: middle - 1], end[middle - 1])
+            move = self._program(error, drift[:middle], levels, least, most)
             if move is None:
                 high = middle - 1
             else:
                 low, found = middle, move
         return low, found
 
-    def _program(self, error: Array, drift: Array, level: Array, u: Array) -> Array | None:
+    def _program(self, error: Array, drift: Array, level: Array, least: Array, most: Array) -> Array | None:
         """The move, nearest to that of the LQ law, that keeps |drift + forced move| <= level, in units; or None."""
-        h, unit, limits, size = len(level), self._law.unit, self.problem.limits, level[0]
+        h, unit, size = len(level), self._law.unit, level[0]
         if h not in self._solvers:
-            rows = self._forced[:h].reshape(-1, len(u))
-            self._solvers[h] = DaqpSolver(QuadraticProgram(np.eye(len(u)), rows, len(u)))
-        free, most = drift.ravel(), np.repeat(level, drift.shape[1])
-        low = np.concatenate([(limits.u_min - u) / unit, -most - free]) / size
-        high = np.concatenate([(limits.u_max - u) / unit, most - free]) / size
+            rows = self._forced[:h].reshape(-1, len(unit))
+            self._solvers[h] = DaqpSolver(QuadraticProgram(np.eye(len(unit)), rows, len(unit)))
+        free, within = drift.ravel(), np.repeat(level, drift.shape[1])
+        low = np.concatenate([least / unit, -within - free]) / size
+        high = np.concatenate([most / unit, within - free]) / size
         solver = self._solvers[h]
         solver.start()
         solution = solver.solve(
