@@ -63,7 +63,7 @@ def counts(controller, **settings):
     return mampc.Regulator(controller, **settings).value_of_information
 
 
-def test_plans_count_on_later_data_where_few_moves_have_a_price_and_no_offset_is_promised():
+def test_plans_count_on_later_data_where_few_moves_have_a_price():
     model = identified_tank()
     problem = tank_problem(model, control_horizon=3)
     assert counts(mampc.MAMPC(problem, PRICE))
@@ -73,9 +73,10 @@ def test_plans_count_on_later_data_where_few_moves_have_a_price_and_no_offset_is
     for rules in (MoveRules(max_moves=2, sparsity_horizon=3), MoveRules(price=1.0, min_size=1.0)):
         assert not counts(mampc.MAMPC(problem, rules))
     assert not counts(mampc.MAMPC(problem, PRICE, method="greedy"))
-    promised = replace(problem, tail_horizon=2000.0)
-    assert np.isfinite(mampc.largest_offset(promised, PRICE)).all()
-    for other in (promised, replace(problem, zone_above=1.0), replace(problem, control_horizon=7)):
+    promised = mampc.Regulator(mampc.MAMPC(replace(problem, tail_horizon=2000.0), PRICE))
+    assert promised.value_of_information
+    assert np.isfinite(promised.largest_offset()).all()
+    for other in (replace(problem, zone_above=1.0), replace(problem, control_horizon=7)):
         assert not counts(mampc.MAMPC(other, PRICE))
     runs_away = mampc.StateSpace([[1.05]], [[1.0]], [[1.0]], None, 1.0)
     limits = mampc.Limits(u_min=-9.0, u_max=9.0)
@@ -111,9 +112,7 @@ def test_a_study_has_the_same_defaults(table, of_mpc, of_price):
         np.testing.assert_array_equal(made["exact price"].estimator.noise, [0.2, 0.2])
 
 
-@pytest.mark.parametrize("price", [0.1, 1.0])
-@pytest.mark.parametrize("bank", [False, True])
-def test_a_delay_that_the_model_lacks_is_forgiven(price, bank):
+def with_a_missing_delay(price):
     model, plant = (
         mampc.StateSpace.from_first_order(gain=[[2.0]], time_constant=[[20.0]], dead_time=[[delay]], dt=1.0)
         for delay in (0.0, 3.0)
@@ -122,12 +121,33 @@ def test_a_delay_that_the_model_lacks_is_forgiven(price, bank):
         model, prediction_horizon=30, control_horizon=4, move_weight=0.1, tail_horizon=30.0,
         limits=mampc.Limits(u_min=-10.0, u_max=10.0),
     )  # fmt: skip
+    return mampc.MAMPC(problem, MoveRules(price=price)), plant, mampc.steps(300, [0.0], [(5, [1.0])])
+
+
+@pytest.mark.parametrize("price", [0.1, 1.0])
+@pytest.mark.parametrize("bank", [False, True])
+def test_a_delay_that_the_model_lacks_is_forgiven(price, bank):
+    controller, plant, reference = with_a_missing_delay(price)
+    model = controller.problem.model
     estimator = LoadBank(model, noise=0.02) if bank else KalmanFilter.offset_free(model)
-    regulator = mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=price)), estimator)
-    reference = mampc.steps(300, [0.0], [(5, [1.0])])
+    regulator = mampc.Regulator(controller, estimator, value_of_information=False)
     run = mampc.simulate(plant, regulator, reference, noise=0.02, seed=1, progress=False)
     assert not np.diff(run.u[200:], axis=0).any()
     assert np.abs(run.y[200:] - 1.0).max() < (0.1 if price < 1 else 0.15)  # what the price leaves
+
+
+def test_plans_that_count_on_later_data_move_less_beside_a_delay_that_the_model_lacks():
+    controller, plant, reference = with_a_missing_delay(0.1)
+    moves, error = [], []
+    for counts in (False, True):
+        regulator = mampc.Regulator(
+            controller, LoadBank(controller.problem.model, noise=0.02), value_of_information=counts
+        )
+        batch = mampc.simulate_batch(plant, regulator, reference, noise=0.02, seeds=range(8), progress=False)
+        moves.append(np.count_nonzero(np.diff(batch.u, axis=1)))
+        error.append(np.square(batch.y - reference).mean())
+    assert moves[1] < 0.8 * moves[0]
+    assert error[1] < 1.1 * error[0]
 
 
 @pytest.mark.parametrize("delay", [6.0, 10.0])

@@ -35,14 +35,17 @@ def model_and_plant(seed):
 
 
 def loop(model, plant, controller, where, bank, size, steps=600):
-    """Outputs of the plant with a step disturbance from sample 20 on, and the decisions."""
+    """A regulator, outputs of the plant with a step disturbance from sample 20 on, and the decisions."""
     kalman = mampc.KalmanFilter.offset_free(model, disturbance=where)
     regulator = mampc.Regulator(controller, mampc.LoadBank(model, noise=0.1) if bank else kalman)
-    disturbance = np.where(np.arange(steps)[:, None] >= 20, size, 0.0)
-    run = mampc.simulate(
-        plant, regulator, model.y_op, steps=steps, progress=False, **{f"{where}_disturbance": disturbance}
-    )
-    return run.y, run.decisions
+    state, x, outputs, decisions = regulator.initial_state(), np.zeros(model.n_states), [], []
+    for k in range(steps):
+        load = size * (k >= 20)
+        outputs.append(model.y_op + plant.C @ x + load * (where == "output"))
+        decisions.append(regulator.step(state, outputs[-1], model.y_op))
+        state = decisions[-1].state
+        x = plant.A @ x + plant.B @ (decisions[-1].u - model.u_op + load * (where == "input"))
+    return regulator, outputs, decisions
 
 
 @pytest.mark.parametrize(("seed", "where", "bank"), CASES)
@@ -50,7 +53,7 @@ def test_mpc_removes_step_disturbances_though_the_model_is_wrong(seed, where, ba
     model, plant = model_and_plant(seed)
     problem = mampc.TrackingProblem(model, prediction_horizon=30, control_horizon=4, move_weight=1.0)
     size = np.array([1.0, -2.0])
-    y, decisions = loop(model, plant, mampc.MPC(problem), where, bank, size)
+    _, y, decisions = loop(model, plant, mampc.MPC(problem), where, bank, size)
     assert {d.status.value for d in decisions} == {"optimal"}
     seen = np.abs(size if where == "output" else plant.dc_gain() @ size).max()
     assert np.abs(y[-1] - model.y_op).max() < 0.01 * seen
@@ -65,9 +68,9 @@ def test_with_a_price_what_stays_is_within_the_bound_of_the_price_though_the_mod
         model, prediction_horizon=30, control_horizon=4, move_weight=1.0, tail_horizon=2000.0
     )
     rules = mampc.MoveRules(price=5.0)
-    bound = mampc.largest_offset(problem, rules)
-    assert np.isfinite(bound).all()
-    y, decisions = loop(model, plant, mampc.MAMPC(problem, rules), where, bank, np.array([1.0, -2.0]))
+    controller = mampc.MAMPC(problem, rules)
+    regulator, y, decisions = loop(model, plant, controller, where, bank, np.array([1.0, -2.0]))
+    bound = regulator.largest_offset(decisions[-1].state)
     assert not any(d.moves[0].any() for d in decisions[-50:])
     assert (np.abs(y[-1] - model.y_op) <= bound * (1 + 1e-6)).all()
     assert (bound < 0.2).all()

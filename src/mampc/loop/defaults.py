@@ -14,7 +14,6 @@ import numpy as np
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.mampc import MAMPC
-from mampc.controllers.offset import largest_offset
 from mampc.loop.doubt import runs_away
 from mampc.loop.estimator import Estimator
 from mampc.loop.kalman_filter import KalmanFilter
@@ -55,8 +54,7 @@ def counts_on_later_data(controller: Controller, estimator: Estimator) -> bool:
     """Whether plans count on later measurements unless told otherwise.
 
     They do with a `LoadBank` where moves have a price and what these will tell is known: for the exact search of a few
-    moves of any size, about set points. A plant that runs away cannot wait, and where the tail is long enough for
-    `largest_offset` to promise something, that promise is kept, which plans that wait would not.
+    moves of any size, about set points. A plant that runs away cannot wait.
     """
     priced = [one for one in controller.each if type(one) is MAMPC and not one.is_plain]
     return (
@@ -76,5 +74,4 @@ def _knows_what_they_tell(controller: MAMPC) -> bool:
         and not np.any(rules.min_size)
         and rules.levels is None
         and not controller.problem.zoned.any()
-        and not np.isfinite(largest_offset(controller.problem, controller.rules)).any()
     )

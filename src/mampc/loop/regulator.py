@@ -21,6 +21,7 @@ from mampc.controllers.bank import ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.controllers.mampc import MAMPC
+from mampc.controllers.offset import offset_of
 from mampc.loop.actuators import LATEST, Actuators
 from mampc.loop.defaults import counts_on_later_data, default_estimator
 from mampc.loop.estimator import Estimate, Estimator
@@ -47,8 +48,8 @@ class Regulator:
             all is believed; from then on they are held until one is. 0 holds at once.
         value_of_information: plan with what later measurements will tell (see docs/how-it-decides.md): needs `MAMPC`
             and an estimator that knows the noise in output units, a `LoadBank`. Objectives of decisions hold it
-            then, and what `largest_offset` promises does not. Default where moves have a price, these are few, and
-            nothing runs away (`loop.defaults`); not where `largest_offset` is finite, which plans that wait may exceed.
+            then, and offsets up to `Regulator.largest_offset` may stay, which is more than `mampc.largest_offset`.
+            Default where moves have a price, these are few, and nothing runs away (`loop.defaults`).
         price_follows_noise: the price is for the noise that the estimator was told, and is scaled by the variance of
             what it finds; for noise that was guessed. Needs `value_of_information` and an exact search by a table.
         applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
@@ -128,6 +129,20 @@ class Regulator:
     def __repr__(self) -> str:
         counts = ", value_of_information=True" if self.value_of_information else ""
         return f"Regulator({type(self.controller).__name__}, {self.estimator!r}{counts})"
+
+    def largest_offset(self, state: RegulatorState | None = None) -> Array:
+        """The largest offset of each output, shape (l,), that can stay for good, in output units.
+
+        See `mampc.largest_offset` for when it holds and where it is infinite. Plans that count on later data may wait
+        for these at every sample anew, with an offset of some times the noise, and this is part of it.
+
+        Args:
+            state: whose estimate says how loads behave, and how large the noise is; default steady loads, and the noise
+                as told.
+        """
+        weights = None if state is None else self.estimator.weights_of(state.estimate)
+        largest: Array = np.max([offset_of(one, weights) for one in self._planner.each], axis=0)
+        return largest
 
     def initial_state(
         self, u_previous: Any = None, y: Any = None, measured_disturbance: Any = None

@@ -55,6 +55,7 @@ class Information:
             )
         self._price_of = price_of
         self._m, self.hypotheses = problem.model.n_inputs, len(shifts)
+        self._n_moves = problem.control_horizon * self._m
         self._later: list[tuple[Array, Array]] = []  # U, and T G of all hypotheses side by side
         for j in range(1, problem.control_horizon):
             from_then_on = replace(
@@ -115,6 +116,12 @@ class Information:
             known = self._tables[id(patterns)] = patterns, rows.T, prices
         charges: Array = weights @ known[1] - known[2]
         return charges
+
+    @property
+    def steady(self) -> InformationNow:
+        """Under the hypothesis of the steadiest loads alone, by which later data tell least; the noise is as told."""
+        told = self.forgone(np.zeros(self._n_moves, dtype=bool))
+        return self.at(np.eye(self.hypotheses)[told.argmin()])
 
     def at(self, weights: Array) -> InformationNow:
         """With these weights of the hypotheses, shape (B,)."""

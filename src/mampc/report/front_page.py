@@ -21,7 +21,7 @@ from mampc.report.fronts import SHOWN, WIDEST
 from mampc.report.interactive import interactive_page
 from mampc.report.page_content import DAY, Means
 from mampc.study.regulators import regulator_of
-from mampc.study.running import StudyResult, prepare, run_controller
+from mampc.study.running import Made, StudyResult, prepare, run_controller
 from mampc.study.schema import ControllerTable
 
 Rows = list[dict[str, Any]]
@@ -70,16 +70,18 @@ def front_page(
     means: dict[str, dict[str, tuple[float, float]]] = {s.name: {} for s in study.scenarios}
     runs: dict[str, dict[str, Run]] = {s.name: {} for s in study.scenarios}
     tables: dict[str, ControllerTable] = {}
+    made: dict[str, Made] = {}
     for number, (task, named, point) in enumerate(chosen, 1):
         regulator = regulator_of(study, prepared.model, task.table)
         run = run_controller(study, prepared, task.scenario, regulator)
         days = (study.steps - study.skip) * study.dt / DAY
         means[task.scenario.name][named] = float(point.moves.mean()) / days, float(point.error.mean())
         runs[task.scenario.name][named] = run
+        made[named] = Made.of(regulator)
         tables[named] = task.table.model_copy(update={"name": named})
         on_run(number, len(chosen))
     shown_study = study.model_copy(update={"controllers": list(tables.values())})
-    result = StudyResult(shown_study, prepared.model, prepared.data, prepared.identified, runs, ())
+    result = StudyResult(shown_study, prepared.model, prepared.data, prepared.identified, runs, (), made)
     told = (
         f"Moves and errors are means over {sweep.seeds} {'seeds' if sweep.seeds > 1 else 'seed'} of noise and loads; "
         "trajectories, and what they mean for the actuators, are of one of them."

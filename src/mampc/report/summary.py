@@ -10,7 +10,6 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.loop.run import Run
 from mampc.study import Study, StudyResult
-from mampc.study.regulators import regulator_of
 from mampc.study.wear import Ratings, ratings_of
 
 
@@ -18,9 +17,6 @@ def summarise(result: StudyResult) -> dict[str, Any]:
     """The content of summary.json: plain numbers, lists and text, no number that JSON cannot hold."""
     study, model, identified = result.study, result.model, result.identified
     ratings = ratings_of(study, model.n_inputs)
-    counting = {
-        table.name: regulator_of(study, model, table).value_of_information for table in study.controllers
-    }
     return {
         "study": study.name,
         "steps": study.steps,
@@ -41,7 +37,8 @@ def summarise(result: StudyResult) -> dict[str, Any]:
                 "controllers": [
                     {
                         "name": table.name,
-                        "counts_on_later_data": counting[table.name],
+                        "counts_on_later_data": result.made[table.name].counts_on_later_data,
+                        "largest_offset": _known(result.made[table.name].largest_offset),
                         **_controller(result.runs[scenario.name][table.name], study, ratings),
                     }
                     for table in study.controllers
@@ -70,7 +67,7 @@ def _controller(run: Run, study: Study, ratings: Ratings) -> dict[str, Any]:
 
 
 def _known(values: Array) -> list[float | None]:
-    return [None if np.isnan(value) else value for value in values.tolist()]
+    return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
 def _gap(gaps: Array) -> dict[str, float | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class StudyResult:
         data, identified: the record and the identification, None where the model came from a file.
         runs: scenario name -> controller name -> `Run`.
         warnings: what the user should know before trusting the figures.
+        made: controller name -> what is known of its regulator beside its runs.
     """
 
     study: Study
@@ -53,6 +54,23 @@ class StudyResult:
     identified: Identified | None
     runs: dict[str, dict[str, Run]]
     warnings: tuple[str, ...]
+    made: dict[str, Made]
+
+
+class Made(NamedTuple):
+    """What is known of a regulator before it runs.
+
+    Attributes:
+        counts_on_later_data: whether its plans do.
+        largest_offset: of each output, shape (l,), that may stay for good; infinite where nothing is promised.
+    """
+
+    counts_on_later_data: bool
+    largest_offset: Array
+
+    @classmethod
+    def of(cls, regulator: Regulator) -> Made:
+        return cls(regulator.value_of_information, regulator.largest_offset())
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +118,8 @@ def run_study(
             runs[scenario.name][table.name] = run
             on_run(scenario.name, table.name, run)
     warnings = cautions(study, problem_of(study, prepared.model), _reference(study, prepared)) + _faults(runs)
-    return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings)
+    made = {name: Made.of(regulator) for name, regulator in regulators.items()}
+    return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings, made)
 
 
 def prepare(
