@@ -350,8 +350,8 @@ def test_out_of_time_branching_keeps_a_valid_bound():
 
 def test_prices_of_moves_that_can_be_large_take_one_relaxed_program(monkeypatch):
     problem = random_problem(3, n_c=8, limits=mampc.Limits(u_min=-1e4, u_max=1e4))
-    rounds, solve = [], SampleRelaxation._solve
-    monkeypatch.setattr(SampleRelaxation, "_solve", lambda *of: rounds.append(1) or solve(*of))
+    rounds, solve = [], SampleRelaxation._data
+    monkeypatch.setattr(SampleRelaxation, "_data", lambda *of: rounds.append(1) or solve(*of))
     rng = np.random.default_rng(3)
     decision = decide(problem, mampc.MoveRules(price=1.0), rng.standard_normal(3), 2 * rng.standard_normal(2))
     assert decision.status is Status.OPTIMAL

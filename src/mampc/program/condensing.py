@@ -270,7 +270,7 @@ class CondensedQP:
         if sample.distances is None:
             sample.distances = program.distances(sample.moves, sample.lower, sample.upper)
         delta, excess = program.relaxed(sample.distances, multipliers)
-        return LeastSquares(sample.target + delta, sample.cost + excess)
+        return LeastSquares(sample.target + delta, sample.cost + float(excess))
 
     def relaxed_limits(self, sample: Sample, multipliers: Array) -> tuple[Array, float]:
         """The same as `linear` gives it, for heuristics: c + f' d + 1/2 d' H d.

@@ -222,18 +222,19 @@ class LeastDistance:
             excess += self._cost.of(better.z[:v])
         return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated)
 
-    def relaxed(self, distances: tuple[Array, Array], multipliers: Array) -> tuple[Array, float]:
-        """The optimum with limits priced by multipliers: its delta, and its cost beyond that of the optimum without.
+    def relaxed(self, distances: tuple[Array, Array], multipliers: Array) -> tuple[Array, Array]:
+        """The optima with limits priced by multipliers: their delta, and their cost beyond that of the one without.
 
-        `distances` of the bounds, as `distances` gives them.
+        Multipliers of shape (..., v + b), `distances` of the bounds, as `distances` gives them.
         """
         pull, v, (low, high) = multipliers / self.even, self._v, distances
         gradient = pull.dot(self._every)
         gradient += self._f
-        square, kept = 0.25 * float(gradient.dot(gradient)), float(pull.dot(np.where(pull > 0, high, low)))
+        square = 0.25 * (gradient * gradient).sum(axis=-1)
+        kept = (pull * np.where(pull > 0, high, low)).sum(axis=-1)
         # Where moves are nearly the same, squares far above the cost cancel each other: no bound may gain by that.
-        lost = len(gradient) * ROUNDING * (square + abs(kept))
-        return -0.5 * gradient[v:], -square - kept - lost
+        lost = gradient.shape[-1] * ROUNDING * (square + abs(kept))
+        return -0.5 * gradient[..., v:], -square - kept - lost
 
     def distances(self, optimum: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
         """The bounds as distances from the optimum."""

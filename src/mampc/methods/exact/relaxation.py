@@ -20,6 +20,7 @@ from mampc.program.qp import UNBOUNDED, QPStatus
 from mampc.program.sample import Indices, Sample
 
 ROUNDS = 6  # of turning signs
+INFEASIBLE = (QPStatus.INFEASIBLE, QPStatus.BAD_DATA)  # data are finite here: bad ones are bounds that cross
 
 
 class Multipliers(NamedTuple):
@@ -47,8 +48,7 @@ class Multipliers(NamedTuple):
     @property
     def infeasible(self) -> bool:
         """Whether no moves keep the limits."""
-        # Data are finite here: bad ones are bounds that cross.
-        return self.status in (QPStatus.INFEASIBLE, QPStatus.BAD_DATA)
+        return self.status in INFEASIBLE
 
     @property
     def solved(self) -> bool:
@@ -85,13 +85,63 @@ class Relaxation:
     def at(self, sample: Sample, optimum: Array, deadline: float = np.inf) -> SampleRelaxation:
         """Those of one sample, given the optimum without limits in these moves, shape (n,).
 
-        No signs are turned after the deadline, of `perf_counter`.
+        None is solved after the deadline, of `perf_counter`.
         """
         return SampleRelaxation(self, sample, optimum, deadline)
 
 
+class Start(NamedTuple):
+    """Where a program starts: active bounds, or None for none, and the signs of its moves, shape (n,)."""
+
+    active: Array | None
+    signs: Array
+
+
+class RelaxedMany(NamedTuple):
+    """K relaxed programs, as `Multipliers` has one; rows, pulls and moves are zero without an answer.
+
+    Attributes:
+        status: K of them.
+        rows: shape (K, bounds).
+        pulls, moves: shape (K, n).
+        starts: for programs alike, K of them.
+    """
+
+    status: list[QPStatus]
+    rows: Array
+    pulls: Array
+    moves: Array
+    starts: list[Start]
+
+    @property
+    def solved(self) -> BoolArray:
+        return np.array([status is QPStatus.OPTIMAL for status in self.status])
+
+    @property
+    def infeasible(self) -> BoolArray:
+        return np.array([status in INFEASIBLE for status in self.status])
+
+    @property
+    def out_of_time(self) -> bool:
+        return QPStatus.TIME_LIMIT in self.status
+
+    @property
+    def without_answer(self) -> list[int]:
+        """The programs that may have an answer which was not found."""
+        return [k for k, status in enumerate(self.status) if status not in (QPStatus.OPTIMAL, *INFEASIBLE)]
+
+
+def alone(found: Multipliers, start: Start) -> RelaxedMany:
+    """One relaxed program as one of many."""
+    return RelaxedMany([found.status], found.rows[None], found.pulls[None], found.moves[None], [start])
+
+
 class SampleRelaxation:
-    """The relaxed programs of one sample; each starts from the active bounds of the last one."""
+    """The relaxed programs of one sample.
+
+    Attributes:
+        start: of the next single program: the last one's end.
+    """
 
     def __init__(self, of: Relaxation, sample: Sample, optimum: Array, deadline: float) -> None:
         self._of, self._optimum, self._deadline = of, optimum, deadline
@@ -99,54 +149,76 @@ class SampleRelaxation:
         self._lower = np.concatenate((sample.lower[:v], none, sample.lower[n_simple:]))
         self._upper = np.concatenate((sample.upper[:v], none, sample.upper[n_simple:]))
         self._distances = of.program.distances(optimum, self._lower, self._upper)
-        self._active: Array | None = None
-        self._signs = np.where(optimum < 0, -1.0, 1.0)
+        self.start = Start(None, np.where(optimum < 0, -1.0, 1.0))
 
     def solve(self, low: Array, high: Array) -> Multipliers:
         """With the moves between low and high, shape (n,)."""
-        return self._solve(self._optimum, low, high)
+        none = np.zeros(len(low))
+        return self.solve_priced(low, high, none, none)
 
     def solve_priced(self, low: Array, high: Array, up: Array, down: Array) -> Multipliers:
         """The same at a price per unit up and one per unit down, shape (n,)."""
-        priced = (up > 0) | (down > 0)
-        if not priced.any():
-            return self.solve(low, high)
-        sign, inverse, rounds = self._signs, self._of.inverse, ROUNDS
-        while True:
-            sign = np.where(low >= 0, 1.0, np.where(high <= 0, -1.0, sign))
-            positive = sign > 0
-            slope = np.where(positive, up, -down)
-            found = self._solve(
-                self._optimum - 0.5 * (inverse @ (slope @ inverse)),
-                np.where(priced & positive, np.maximum(low, 0.0), low),
-                np.where(priced & ~positive, np.minimum(high, 0.0), high),
+        found = self.solve_many(low[None], high[None], up[None], down[None], [self.start])
+        self.start = found.starts[0]
+        return Multipliers(found.rows[0], found.pulls[0], low < high, found.moves[0], found.status[0])
+
+    def solve_many(self, low: Array, high: Array, up: Array, down: Array, starts: list[Start]) -> RelaxedMany:
+        """The same for K programs at once, all of shape (K, n). Past the deadline no more are solved."""
+        program, own, K = self._of.program, self._of.moves, len(low)
+        status, active = [QPStatus.TIME_LIMIT] * K, [start.active for start in starts]
+        multipliers, moves = np.zeros((K, len(program.even))), np.zeros(low.shape)
+        priced, sign = (up > 0) | (down > 0), np.array([start.signs for start in starts])
+        sign = np.where(low >= 0, 1.0, np.where(high <= 0, -1.0, sign))
+        pulls, rows = np.zeros(low.shape), np.arange(K)
+        for _ in range(ROUNDS):
+            upwards, downwards = priced[rows] & (sign[rows] > 0), priced[rows] & (sign[rows] < 0)
+            least, most = low[rows], high[rows]
+            slope = np.where(upwards, up[rows], np.where(downwards, -down[rows], 0.0))
+            optima, distances, bounds = self._data(
+                np.where(upwards, np.maximum(least, 0.0), least),
+                np.where(downwards, np.minimum(most, 0.0), most),
+                slope,
             )
-            if not found.solved:
-                return found
-            pulls = found.pulls + slope
+            solved = np.zeros(len(rows), dtype=bool)
+            for k, row in enumerate(rows.tolist()):
+                if perf_counter() > self._deadline:
+                    break
+                found = program.solve_at(optima[k], distances[k], bounds[k], active[row])
+                if found.moves is not None and found.multipliers is not None:
+                    solved[k], status[row] = True, QPStatus.OPTIMAL
+                    active[row] = active_bounds(found.multipliers)
+                    multipliers[row], moves[row] = found.multipliers, found.moves
+                elif status[row] is not QPStatus.OPTIMAL:
+                    status[row], active[row] = found.status, None
+            pull = multipliers[rows, own] + slope
+            pulls[rows[solved]] = pull[solved]
             # At zero the price of the other direction has to hold the move there too.
-            turned = priced & np.where(positive, (pulls < -down) & (low < 0), (pulls > up) & (high > 0))
-            rounds -= 1
-            if not rounds or not turned.any() or perf_counter() > self._deadline:
-                self._signs = sign
-                return found._replace(pulls=pulls, free=low < high)
-            sign = np.where(turned, -sign, sign)
+            turned = upwards & (pull < -down[rows]) & (least < 0)
+            turned |= downwards & (pull > up[rows]) & (most > 0)
+            turned &= solved[:, None]
+            sign[rows] = np.where(turned, -sign[rows], sign[rows])
+            rows = rows[turned.any(axis=1)]
+            if not len(rows):
+                break
+        multipliers[:, own] = 0.0
+        ends = [Start(*end) for end in zip(active, sign, strict=True)]
+        return RelaxedMany(status, multipliers, pulls, moves, ends)
 
-    def _solve(self, optimum: Array, low: Array, high: Array) -> Multipliers:
-        lower, upper = self._lower.copy(), self._upper.copy()
-        lower[self._of.moves], upper[self._of.moves] = low, high
-        nearest = self._of.program.solve(optimum, lower, upper, self._active)
-        if nearest.moves is None or nearest.multipliers is None:
-            self._active, none = None, np.zeros(0)
-            return Multipliers(none, none, none != 0, none, nearest.status)
-        self._active, rows = active_bounds(nearest.multipliers), nearest.multipliers.copy()
-        rows[self._of.moves] = 0.0
-        return Multipliers(rows, nearest.multipliers[self._of.moves], low < high, nearest.moves)
+    def _data(self, low: Array, high: Array, slope: Array) -> tuple[Array, Array, Array]:
+        """Optima, distances and bounds of programs at these slopes of the cost, as `solve_at` takes them."""
+        of, even = self._of, self._of.program.even
+        optima = self._optimum - 0.5 * ((slope @ of.inverse) @ of.inverse.T)
+        bounds = np.empty((len(low), 2, len(even)))
+        bounds[:, 0], bounds[:, 1] = self._lower, self._upper
+        bounds[:, 0, of.moves], bounds[:, 1, of.moves] = low, high
+        distances = bounds * even
+        distances[:, :, of.moves.start :] -= (optima @ of.program.even_rows.T)[:, None]
+        return optima, distances.reshape(len(low), -1), bounds.reshape(len(low), -1)
 
-    def priced(self, rows: Array, pulls: Array) -> tuple[Array, float]:
-        """What multipliers of rows and pulls at the moves add to the target and to the least cost without limits."""
+    def priced(self, rows: Array, pulls: Array) -> tuple[Array, Array]:
+        """What multipliers of rows and pulls at the moves, (..., n), add to the target and to the least cost."""
         multipliers = rows.copy()
-        multipliers[self._of.moves] = pulls
+        multipliers[..., self._of.moves] = pulls
         return self._of.program.relaxed(self._distances, multipliers)
 
     def of_bounds(self, multipliers: Array | None) -> Multipliers | None:

@@ -75,9 +75,15 @@ class SampleProblem:
         pattern[self.order[positions]] = True
         return pattern
 
+    def patterns(self, made: BoolArray) -> BoolArray:
+        """The patterns, shape (..., n_moves), with the moves that are made, shape (..., n)."""
+        patterns = np.zeros((*made.shape[:-1], self.admissible.n_moves), dtype=bool)
+        patterns[..., self.order] = made
+        return patterns
+
     def moving(self, moves: Array) -> BoolArray:
-        """The pattern of moves, shape (n,), that are more than rounding."""
-        return self.pattern(np.abs(moves) > ROUNDING * self.prefix)
+        """The patterns, shape (..., n_moves), of moves, shape (..., n), that are more than rounding."""
+        return self.patterns(np.abs(moves) > ROUNDING * self.prefix)
 
     def offer(self, pattern: BoolArray, within: tuple[Array, Array] | None = None) -> Multipliers | None:
         """Offer the best plan on a pattern; its multipliers, where it ran into limits.

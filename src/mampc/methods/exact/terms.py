@@ -100,7 +100,7 @@ class Terms:
     def add(self, found: Multipliers) -> None:
         """Take one more term, in place of the oldest but the first where there are too many."""
         s = np.where(self._domain.bounded & found.free, found.pulls, 0.0)
-        self._put(*self.priced(found, s), s)
+        self._put(*self.priced(found.rows, s), s)
 
     def drop_latest(self) -> None:
         """Forget the latest of terms that are few."""
@@ -117,12 +117,12 @@ class Terms:
         """The bound before anything is decided, where so many moves are left, of which so many are made at least."""
         return float((self.rest + self.later(0, np.array([left]), None, more)[0]).max())
 
-    def priced(self, found: Multipliers, s: Array) -> tuple[Array, float]:
-        """c and rest with these multipliers of rows and the pulls s."""
-        shift, excess = self._relaxation.priced(found.rows, s)
+    def priced(self, rows: Array, s: Array) -> tuple[Array, Array]:
+        """c and rest with these multipliers of rows, shape (..., rows), and the pulls s, shape (..., n)."""
+        shift, excess = self._relaxation.priced(rows, s)
         return self._c + shift, self._rest + excess
 
-    def _put(self, c: Array, rest: float, s: Array) -> None:
+    def _put(self, c: Array, rest: float | Array, s: Array) -> None:
         self._made += 1
         support = self._domain.support(s)
         tables = self._bounds_of_later(support)

@@ -85,8 +85,7 @@ class PatternTree:
         if self._zoned:
             return search_zones(problem, solver, self._local)
         limited, close = bool(sample.margins.min(initial=np.inf) < 0), self._close
-        if limited:
-            self._relax_root(problem)
+        root = self._relax_root(problem) if limited else None
         batches = _BatchSearch(problem)
         if not (limited and close):
             terms, f = problem.terms, np.zeros(self._admissible.n_moves)
@@ -96,21 +95,22 @@ class PatternTree:
             if found is not None and found.active:
                 terms.add(found)
             if not limited and self._admissible.priced and not batches.ends_at_once:
-                close &= self._relax_root(problem, WORTH)
+                root = self._relax_root(problem, WORTH)
+                close &= root is not None
         if problem.terms.at_root(allowance.left) >= problem.cutoff:
             return np.inf
-        return Branching(problem).run() if close and not batches.ends_at_once else batches.run()
+        return Branching(problem).run(root) if close and not batches.ends_at_once else batches.run()
 
-    def _relax_root(self, problem: SampleProblem, worth: float = 0.0) -> bool:
+    def _relax_root(self, problem: SampleProblem, worth: float = 0.0) -> Multipliers | None:
         """Bound everything with limits and prices as a relaxed program has them, and try its moves.
 
         They bound nothing where they close less than a share `worth` of the gap: each batch of nodes would take a
-        program more. Says whether they do.
+        program more. None if they do.
         """
         domain, terms = problem.domain, problem.terms
         found = problem.relaxation.solve_priced(domain.low, domain.high, domain.up, domain.down)
         if not found.solved or not found.active:
-            return False
+            return None
         without = terms.at_root(problem.allowance.left)
         terms.add(found)
         close = terms.at_root(problem.allowance.left) - without >= worth * (problem.cutoff - without)
@@ -119,7 +119,7 @@ class PatternTree:
         pattern = problem.moving(found.moves)
         if self._admissible.allows(pattern, problem.allowance):
             problem.offer_first(pattern)
-        return close
+        return found if close else None
 
 
 class _Pending(NamedTuple):
