@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from mampc.base.checks import Array, BoolArray
 from mampc.loop.estimator import Estimate
@@ -86,7 +85,15 @@ def filters_of(members: Sequence[Member], noise: Array, believed: BoolArray) -> 
     doubtful = (
         np.square(whiten).sum(axis=1) / count if count else filters_of(members, noise, ~believed).precisions
     )
-    return Filters(block_diag(*gains), block_diag(*whiten), doubtful, np.array(log_scale), count)
+    return Filters(_apart(gains), _apart(whiten), doubtful, np.array(log_scale), count)
+
+
+def _apart(blocks: Sequence[Array]) -> Array:
+    """One matrix with blocks of equal shape along its diagonal."""
+    count, rows, columns = np.shape(blocks)
+    matrix = np.zeros((count, rows, count, columns))
+    matrix[range(count), :, range(count)] = blocks
+    return matrix.reshape(count * rows, count * columns)
 
 
 class Mixing:
