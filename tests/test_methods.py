@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -59,12 +60,19 @@ def decide(controller, past, x, reference):
     return controller.step(controller.initial_state(past), x, reference)
 
 
+@cache
+def decided(seed, rules, name):
+    """The decision of a method on a sample; several tests look at it."""
+    problem, *asked = sample(seed)
+    return decide(controller_of(problem, rules, name), *asked)
+
+
 @every_rule
 @every_method
 def test_plans_keep_limits_and_rules_and_cost_what_they_say(name, rules):
     for seed in range(examples(4, quick=2)):
         problem, past, x, reference = sample(seed)
-        decision = decide(controller_of(problem, rules, name), past, x, reference)
+        decision = decided(seed, rules, name)
         changes = np.diff(np.vstack([past[-1:], decision.plan]), axis=0)
         np.testing.assert_allclose(decision.changes, changes, atol=1e-12)
         assert (decision.moves == (np.abs(changes) > 1e-9)).all()
@@ -80,14 +88,12 @@ def test_plans_keep_limits_and_rules_and_cost_what_they_say(name, rules):
 @every_heuristic
 def test_no_plan_is_better_than_the_proven_optimum(name, rules):
     for seed in range(examples(4, quick=2)):
-        asked = sample(seed)
-        best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
-        found = decide(controller_of(asked[0], rules, name), *asked[1:])
+        best, found = decided(seed, rules, "exact"), decided(seed, rules, name)
         assert best.status is Status.OPTIMAL
         assert found.status is Status.FEASIBLE
         assert found.lower_bound == -np.inf
         assert found.objective >= best.objective * (1 - 1e-9)
-        still = decide(controller_of(asked[0], MoveRules(max_moves=0), "exact"), *asked[1:])
+        still = decided(seed, RULES["no moves left"], "exact")
         assert found.objective <= still.objective * (1 + 1e-12)
 
 
@@ -107,10 +113,9 @@ def test_a_budget_of_all_moves_gives_the_plan_of_plain_mpc(name, narrow):
 @pytest.mark.parametrize("rules", [RULES["budget"], RULES["budget and price"]])
 def test_a_certificate_holds_the_proven_optimum(name, rules):
     for seed in range(examples(4, quick=2)):
-        asked = sample(seed)
-        best = decide(controller_of(asked[0], rules, "exact"), *asked[1:])
-        certified = decide(controller_of(asked[0], rules, name, certify=True), *asked[1:])
-        plain = decide(controller_of(asked[0], rules, name), *asked[1:])
+        problem, *asked = sample(seed)
+        best, plain = decided(seed, rules, "exact"), decided(seed, rules, name)
+        certified = decide(controller_of(problem, rules, name, certify=True), *asked)
         assert certified.objective == pytest.approx(plain.objective, rel=1e-12)
         assert certified.lower_bound == pytest.approx(best.objective, rel=1e-8)
         assert certified.gap == pytest.approx(certified.objective - best.objective, abs=1e-7)

@@ -8,7 +8,7 @@ from seeds import examples
 
 CASES = [
     (seed, where, bank)
-    for seed in range(examples(12, quick=4))
+    for seed in range(examples(12, quick=2))
     for where in ("input", "output")
     for bank in (False, True)
 ]

@@ -18,10 +18,10 @@ from mampc import IOData, MampcError, StateSpace, n4sid, prbs, validate
 from mampc.identification.realisation import realise
 from mampc.identification.subspace import hankel_factor, observability
 from random_systems import markov, noise_free, noisy_record, random_system, system_with
-from seeds import examples, seeds
+from seeds import deep, examples, seeds
 
 WEIGHTINGS = ("cva", "n4sid", "moesp")
-ONE_QUICK = ("cva", *(pytest.param(name, marks=pytest.mark.slow) for name in WEIGHTINGS[1:]))
+ONE_QUICK = ("cva", *deep(*WEIGHTINGS[1:]))
 SIZES = [(2, 1, 1), (4, 2, 2), (5, 2, 3)]  # states, inputs, outputs
 
 
@@ -36,7 +36,7 @@ def assert_same_record(fitted, data):
 
 
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
-@pytest.mark.parametrize("feedthrough", [False, True])
+@pytest.mark.parametrize("feedthrough", [True, *deep(False)])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("seed", seeds(3, quick=1))
 def test_a_noise_free_record_gives_back_system_order_and_transient(seed, size, feedthrough, weighting):
@@ -51,7 +51,7 @@ def test_a_noise_free_record_gives_back_system_order_and_transient(seed, size, f
     assert np.max(np.abs(without_transient - data.y)) > 0.1
 
 
-@pytest.mark.parametrize("feedthrough", [False, True])
+@pytest.mark.parametrize("feedthrough", [True, *deep(False)])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("seed", seeds(3, quick=1))
 def test_a_transient_that_shifts_the_means_disturbs_neither_order_nor_dynamics(seed, size, feedthrough):
@@ -83,7 +83,7 @@ def test_the_result_describes_the_record():
     np.testing.assert_array_equal(fitted.fit, fitted.validate(data).fit)
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("weighting", ONE_QUICK)
 @pytest.mark.parametrize("seed", seeds(4, quick=1))
 def test_units_decide_nothing(seed, weighting):
     """Every signal in a unit of its own: the same order, poles, fits, hold-out fits and initial state."""
@@ -209,7 +209,7 @@ def median_fits(name):
 
 
 @pytest.mark.parametrize("method", ["default", "order 4"])
-@pytest.mark.parametrize("name", SIMULATED)
+@pytest.mark.parametrize("name", ["overdamped", "two resonances", *deep("one resonance")])
 def test_unseen_data_is_explained_better_than_by_other_programs(name, method):
     medians = median_fits(name)
     assert medians[method] >= max(medians["SLICOT"], medians["nfoursid"])
@@ -217,7 +217,7 @@ def test_unseen_data_is_explained_better_than_by_other_programs(name, method):
 
 @pytest.mark.parametrize("weighting", ONE_QUICK)
 def test_a_record_taken_in_small_parts_gives_the_same_model(monkeypatch, weighting):
-    data = noisy_record(random_system(1, 4, 2, 2, True), 1)[0]
+    data = noisy_record(random_system(1, 4, 2, 2, True), 1)[0][:700]
     whole = n4sid(data, weighting=weighting)
     monkeypatch.setattr("mampc.identification.subspace._CHUNK", 97)
     monkeypatch.setattr("mampc.identification.simulation_error._ENTRIES", 5000)
@@ -322,7 +322,7 @@ def test_impossible_requests_are_refused(samples, options, message):
         n4sid(data, **options)
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("weighting", ONE_QUICK)
 @pytest.mark.parametrize(("m", "l"), [(1, 1), (2, 2), (1, 3)])
 def test_records_are_identified_from_a_least_length_on(m, l, weighting):
     rng = np.random.default_rng(0)
