@@ -41,3 +41,8 @@ def listed(words: Sequence[str], most: int = 6, separator: str = ", ") -> str:
     """The first words, and how many there are beside them: "u1, u2 and 3 more"."""
     more = f" and {len(words) - most} more" if len(words) > most else ""
     return separator.join(words[:most]) + more
+
+
+def counted(count: int, noun: str) -> str:
+    """ "1 row" or "7 rows"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -2,54 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.base.errors import listed
+from mampc.base.errors import counted, listed
 from mampc.identification.data import IOData
 from mampc.systems.properties import doubtful_gains, properties, time_in_words
 from mampc.systems.state_space import StateSpace
 
+BLOCK = 50_000  # samples looked at together
 FEW_MOVES = 10  # of an input; fewer say little about anything but the largest of them
 TOGETHER = 0.9  # correlation of moves from which two inputs cannot be told apart
 SHORT = 5.0  # settling times: a shorter record has hardly one step of each kind
 LONG_ENOUGH = 12  # settling times
 
 
-def missing_movement(inputs: Mapping[str, Array]) -> list[str]:
+def missing_movement(names: Sequence[str], pieces: Sequence[Array]) -> list[str]:
     """What is missing in the movement of inputs, a sentence each with what to do.
 
     Args:
-        inputs: values by name, shape (N,), not-a-number where there is none.
+        names: of the m inputs.
+        pieces: their values, shape (N, m) or with further columns behind them, not-a-number where there is none.
     """
-    moves = {name: np.nan_to_num(np.diff(values)) for name, values in inputs.items()}
-    said = []
-    for name, own in moves.items():
-        count = int(np.count_nonzero(own))
-        if count < FEW_MOVES:
-            times, samples = "time" if count == 1 else "times", int(np.count_nonzero(~np.isnan(inputs[name])))
-            said.append(
-                f"{name} moves {count} {times} in {samples} samples: move it up and down at least {FEW_MOVES} times"
-            )
-    for (one, a), (other, b) in combinations(moves.items(), 2):
-        size = float(np.linalg.norm(a) * np.linalg.norm(b))
-        together = float(a @ b) / size if size else 0.0
+    m = len(names)
+    counts, samples, products = np.zeros(m, dtype=int), np.zeros(m, dtype=int), np.zeros((m, m))
+    # The last sample of a block begins the next one.
+    for values in (piece[at : at + BLOCK + 1, :m] for piece in pieces for at in range(0, len(piece), BLOCK)):
+        moves = np.nan_to_num(np.diff(values, axis=0))
+        counts += np.count_nonzero(moves, axis=0)
+        samples += np.count_nonzero(~np.isnan(values[:BLOCK]), axis=0)
+        products += moves.T @ moves
+    said = [
+        f"{name} moves {counted(count, 'time')} in {n} samples: move it up and down at least {FEW_MOVES} times"
+        for name, count, n in zip(names, counts.tolist(), samples.tolist(), strict=True)
+        if count < FEW_MOVES
+    ]
+    sizes = np.sqrt(products.diagonal())
+    for i, j in combinations(range(m), 2):
+        together = products[i, j] / (sizes[i] * sizes[j]) if sizes[i] and sizes[j] else 0.0
         if abs(together) > TOGETHER:
             said.append(
-                f"{one} and {other} move together (correlation of moves {together:.2f}): their effects cannot be told "
-                "apart; move them at different times"
+                f"{names[i]} and {names[j]} move together (correlation of moves {together:.2f}): their effects cannot "
+                "be told apart; move them at different times"
             )
     return said
 
 
 def movement_of(records: Sequence[IOData]) -> list[str]:
     """The same of all records together; measured disturbances are not asked to move."""
-    gap = np.full((1, records[0].u.shape[1]), np.nan)
-    u = np.concatenate([part for record in records for part in (record.u, gap)])
-    return missing_movement(dict(zip(records[0].names.inputs, u.T, strict=False)))
+    return missing_movement(records[0].names.inputs, [record.u for record in records])
 
 
 def left_open(model: StateSpace, records: Sequence[IOData]) -> list[str]:

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import as_number
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, counted
 from mampc.identification import Identified, IOData, Validation, n4sid
 from mampc.identification.excitation import left_open, movement_of
-from mampc.identification.export.findings import counted
 from mampc.identification.export.together import read_together
 from mampc.report.figures import validation_figure
 from mampc.report.output import save_figure

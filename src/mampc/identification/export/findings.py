@@ -56,11 +56,6 @@ class Findings:
         raise MampcError("\n".join([f"{self.origin}: {len(self.doubts)} things to decide first", *lines]))
 
 
-def counted(count: int, noun: str) -> str:
-    """ "1 row" or "7 rows"."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def rows_text(numbers: Iterable[int], count: int | None = None) -> str:
     """ "row 3", "rows 3, 9 and 12" or "rows 3, 9, 12, 14, 15 and 30 more"."""
     first = []

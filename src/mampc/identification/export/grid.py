@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mampc.base.checks import Array, BoolArray
+from mampc.base.errors import counted
 from mampc.identification.export.clock import Clock
-from mampc.identification.export.findings import MOST_SHOWN, Findings, counted, rows_text
+from mampc.identification.export.findings import MOST_SHOWN, Findings, rows_text
 
 STRAYING = 0.01  # of dt: rows whose times stray less from even steps are taken as even
 GAP = 1.5  # of dt between rows

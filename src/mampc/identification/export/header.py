@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Collection, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from mampc.base.errors import shown
 from mampc.identification.export.cell_words import SPACES
@@ -14,6 +14,7 @@ from mampc.identification.export.findings import Findings
 UNIT = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")
 
 NOT_UTF_8 = "text is not UTF-8: read as Windows-1252 (Western European)"
+HIDDEN = "hidden worksheets left out"
 NUMBER_LIKE = re.compile(
     rf"[+\-−]?[\d.,]*\d[\d.,]*((?:{SPACES}| )\d{{3}}[.,\d]*)*([eEdD][+\-]?\d+)?", re.ASCII
 )
@@ -54,8 +55,12 @@ def require_columns(
         if name not in header
     }
     hints = [f"did you mean {guess!r} for {name!r}?" for name, guess in guesses.items() if guess]
-    if NOT_UTF_8 in findings.notes:
-        hints.append(f"{NOT_UTF_8}, unless its encoding is passed (--encoding)")
+    hints += [
+        f"{NOT_UTF_8}, unless its encoding is passed (--encoding)"
+        for note in findings.notes
+        if note == NOT_UTF_8
+    ]
+    hints += [note for note in findings.notes if note.startswith(HIDDEN)]
     if any(name in header for name in missing):
         hints.append("a name that stands twice says nothing: rename columns")
     elif all(name in cells for name in missing):
@@ -139,11 +144,10 @@ def joined_names(pair: Sequence[Row]) -> tuple[str, ...] | None:
     return tuple(names)
 
 
-def likelihood(reading: tuple[str | None, Any, Sequence[Row]]) -> tuple[bool, bool, int]:
+def likelihood(separator: str | None, head: Sequence[Row]) -> tuple[bool, bool, int]:
     """How likely fields are parted right: not by spaces, which stamps and words have too, unless nothing else parts
     them; with a header for most rows; and in how many cells.
     """
-    separator, _, head = reading
     even = _evenness(head)
     headed = even > 0 and len(without_empty_end(head[likeliest_header(head)][1])) > 1
     return separator != " " and even > 0, headed, even

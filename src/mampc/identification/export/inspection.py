@@ -205,4 +205,4 @@ def _missing_excitation(columns: Sequence[ColumnSummary], inputs: Sequence[str])
     }
     if not chosen:
         return ["no column moves in steps, up and down, as an input under test does"]
-    return missing_movement(chosen)
+    return missing_movement(list(chosen), [np.column_stack(list(chosen.values()))])

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mampc.base.checks import Array, as_number, as_whole
-from mampc.base.errors import MampcError, shown
+from mampc.base.errors import MampcError, counted, shown
 from mampc.base.names import Names
 from mampc.identification.data import IOData
 from mampc.identification.export.clock import Clock, read_clock
-from mampc.identification.export.findings import Findings, counted
+from mampc.identification.export.findings import Findings
 from mampc.identification.export.grid import STRAYING, Grid, bridged, make_grid, pieces, resampled
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numbers import Reading, read_numbers

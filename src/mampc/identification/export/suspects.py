@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mampc.base.checks import Array
-from mampc.identification.export.findings import Findings, counted, rows_text
+from mampc.base.errors import counted
+from mampc.identification.export.findings import Findings, rows_text
 
 LEAP = 10.0  # times what is seldom exceeded from one sample to the next
 LONGEST_LEAP = 20  # samples; what stays away longer may be a move

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, counted
 from mampc.identification.data import IOData
-from mampc.identification.export.findings import counted
 from mampc.identification.export.reading import Export, read_export
 
 

@@ -10,15 +10,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, shown
+from mampc.identification.export.findings import Findings
+from mampc.identification.export.header import HIDDEN, Row
 
 UNPACKED_LIMIT = 2**30  # bytes
 CELL_LIMIT = 50_000_000
 INSTALL = "pip install 'mampc[data]'"
 
 
-def read_workbook(path: Any, content: bytes) -> list[Callable[[], Iterator[list[tuple[int, list[str]]]]]]:
-    """One function a worksheet of an .xlsx file, which yields its rows as words with their numbers, in one block.
+def read_workbook(
+    path: Any, content: bytes, findings: Findings
+) -> list[tuple[str, Callable[[], Iterator[list[Row]]]]]:
+    """The worksheets of an .xlsx file that are not hidden: title, and a function that yields all rows in one block.
 
     Raises:
         MampcError: openpyxl is missing, the file is damaged, or unpacks to more than `UNPACKED_LIMIT`.
@@ -34,18 +38,29 @@ def read_workbook(path: Any, content: bytes) -> list[Callable[[], Iterator[list[
                     f"{path}: expected an Excel file that unpacks to {UNPACKED_LIMIT / 2**30:g} GiB at most"
                 )
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
-        readers: list[Callable[[], Iterator[list[tuple[int, list[str]]]]]] = []
-        for worksheet in book.worksheets:
-            rows = [
-                (number, [_word(cell) for cell in row])
-                for number, row in enumerate(worksheet.iter_rows(values_only=True), 1)
-            ]
-            readers.append(partial(iter, [rows]))
+        visible = [sheet for sheet in book.worksheets if sheet.sheet_state == "visible"]
+        if len(visible) < len(book.worksheets):
+            hidden = [sheet.title for sheet in book.worksheets if sheet.sheet_state != "visible"]
+            findings.note(f"{HIDDEN}: {shown(hidden)}")
+        return [
+            (
+                sheet.title,
+                partial(
+                    iter,
+                    [
+                        [
+                            (n, list(map(_word, row)))
+                            for n, row in enumerate(sheet.iter_rows(values_only=True), 1)
+                        ]
+                    ],
+                ),
+            )
+            for sheet in visible
+        ]
     except MampcError:
         raise
     except Exception as error:  # whatever a damaged file makes of the libraries that unpack it
         raise MampcError(f"{path}: expected a readable Excel file, received: {error}") from None
-    return readers
 
 
 def read_parquet(path: str | Path, content: bytes) -> Any:
