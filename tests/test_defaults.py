@@ -76,7 +76,7 @@ def test_plans_count_on_later_data_where_few_moves_have_a_price():
     promised = mampc.Regulator(mampc.MAMPC(replace(problem, tail_horizon=2000.0), PRICE))
     assert promised.value_of_information
     assert np.isfinite(promised.largest_offset()).all()
-    for other in (replace(problem, zone_above=1.0), replace(problem, control_horizon=7)):
+    for other in (replace(problem, zone_above=1.0), replace(problem, control_horizon=8)):
         assert not counts(mampc.MAMPC(other, PRICE))
     runs_away = mampc.StateSpace([[1.05]], [[1.0]], [[1.0]], None, 1.0)
     limits = mampc.Limits(u_min=-9.0, u_max=9.0)

@@ -9,7 +9,7 @@ import mampc
 from builders import cost_of, random_model, tank_model
 from mampc import Status
 from mampc.loop.hypotheses import HYPOTHESES
-from mampc.methods.exact import search
+from mampc.methods.exact import ranking, search
 from referees import all_patterns, best_on_every_pattern, charge, keeps_rules
 from seeds import seeds
 from test_load_bank import driven
@@ -141,6 +141,24 @@ def test_the_exact_search_finds_the_best_plan_and_proves_it(seed, method, limit,
         assert decision.objective == pytest.approx(own + forgone, rel=1e-8)
     else:  # at a limit a planned move may be nothing as yet
         assert decision.objective <= (own + forgone) * (1 + 1e-8)
+
+
+def test_what_a_tree_searches_is_listed_where_plans_count_on_later_data(monkeypatch):
+    problem, weights = problem_of(tank_model()), np.full(len(HYPOTHESES), 1 / len(HYPOTHESES))
+    asked = {"x": np.zeros(counting(problem, 0.5)[1].problem.model.n_states), "hypotheses": weights}
+    asked["reference"] = problem.model.y_op + np.array([0.5, -0.3])
+    planners = [counting(problem, 0.5, noise=0.3)[1]]
+    monkeypatch.setattr(ranking, "LARGEST_TABLE", 0)
+    regulator, planner = counting(problem, 0.5, noise=0.3)
+    assert planner._search.has_table
+    assert not regulator.controller._search.has_table
+    monkeypatch.setattr(search, "LARGEST_BESIDE_DATA", 0)
+    planners += [planner, counting(problem, 0.5, noise=0.3)[1]]
+    assert not planners[-1]._search.has_table
+    decisions = [planner.step(planner.initial_state(), **asked) for planner in planners]
+    for decision in decisions[1:]:
+        np.testing.assert_allclose(decision.plan, decisions[0].plan, atol=1e-9)
+        assert decision.gap == 0
 
 
 def test_every_method_keeps_to_the_same_objective():

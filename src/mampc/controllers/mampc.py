@@ -118,13 +118,17 @@ class MAMPC(Controller):
             raise MampcError(
                 "value_of_information: expected inputs that take any value, received rules with levels"
             )
-        by_table = isinstance(self._search, ExactSearch) and self._search.has_table
+        search = self._search
+        if isinstance(search, ExactSearch):
+            search = search.beside_later_data()
+        by_table = isinstance(search, ExactSearch) and search.has_table
         if price_follows_noise and not by_table:
             raise MampcError(
                 "price_follows_noise: expected method='exact' with so few patterns that all are listed, received "
                 f"{self.method!r} with {self.condensed.n_moves} moves"
             )
         counting = copy(self)
+        counting._search = search
         price_of = self._admissible.charge if price_follows_noise else None
         counting.information = Information(self.problem, shifts, price_of)
         return counting

@@ -35,7 +35,7 @@ from mampc.program.problem import TrackingProblem
 from mampc.program.tail import square_root
 
 HIGHEST_PRICE = 1 / 16  # of what moves save after a change: changes of a quarter of it are still worth them
-FEW = 12  # planned moves, up to which all patterns are looked at
+FEW = 15  # planned moves, up to which all patterns are looked at
 LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
 
 
@@ -122,7 +122,7 @@ def _of_waiting(
     listed = admissible.listed(2**n)
     assert listed is not None
     place = listed @ 2 ** np.arange(n)
-    cost[place] = admissible.charges(listed) + [later_data.charge(pattern) for pattern in listed]
+    cost[place] = admissible.charges(listed) + later_data.each(listed)
     least = cost.copy()  # of a pattern and all with more moves
     for i in range(n):
         without = ~patterns[:, i]

@@ -21,7 +21,7 @@ from mampc.loop.load_bank import LoadBank
 from mampc.methods.alternating import Alternating
 from mampc.methods.exact.search import Exact
 
-FEW = 12  # planned moves, up to which all patterns are listed in a moment
+FEW = 15  # planned moves, up to which all patterns are listed beside later data
 
 
 def has_scarce_moves(controller: Controller) -> bool:

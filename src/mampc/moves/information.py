@@ -90,6 +90,16 @@ class Information:
             )
         return known
 
+    def forgone_by(self, patterns: BoolArray) -> Array:
+        """Of each of many patterns, shape (K, n_moves), under each hypothesis, shape (K, B)."""
+        rows = np.zeros((len(patterns), self.hypotheses))
+        for j in range(len(self._later)):
+            later = patterns[:, (j + 1) * self._m :]
+            packed = np.packbits(later, axis=1)
+            _, first, place = np.unique(packed, axis=0, return_index=True, return_inverse=True)
+            rows += np.array([self._missed(j, pattern) for pattern in later[first]])[place.ravel()]
+        return rows
+
     def _part(self, j: int, later: BoolArray) -> Array:
         """By what a pattern has at the samples from j + 1 on, which many have alike."""
         key = j, later.tobytes()
@@ -112,7 +122,7 @@ class Information:
         known = self._tables.get(id(patterns))
         if known is None:
             prices = np.array([self.price(pattern) for pattern in patterns])
-            rows = np.array([self.forgone(pattern) for pattern in patterns]) + prices[:, None]
+            rows = self.forgone_by(patterns) + prices[:, None]
             known = self._tables[id(patterns)] = patterns, rows.T, prices
         charges: Array = weights @ known[1] - known[2]
         return charges
@@ -149,5 +159,13 @@ class InformationNow(NamedTuple):
         return forgone + self.information.price(pattern) * float(self.weights.sum() - 1)
 
     def charges(self, patterns: BoolArray) -> Array:
-        """The same of patterns (K, n_moves), shape (K,)."""
+        """The same of patterns (K, n_moves) that are asked at every sample, shape (K,)."""
         return self.information.charges(patterns, self.weights)
+
+    def each(self, patterns: BoolArray) -> Array:
+        """The same of patterns (K, n_moves) that are asked once, shape (K,)."""
+        prices = np.array([self.information.price(pattern) for pattern in patterns])
+        charges: Array = self.information.forgone_by(patterns) @ self.weights + prices * (
+            self.weights.sum() - 1
+        )
+        return charges

@@ -17,7 +17,6 @@ from mampc.base.errors import MampcError
 from mampc.controllers import MAMPC, MPC
 from mampc.controllers.controller import Controller
 from mampc.controllers.offset import highest_price
-from mampc.loop.defaults import FEW
 from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.regulator import Regulator
 from mampc.loop.simulation import simulate
@@ -34,6 +33,7 @@ MOST_CHANGES = 4  # of single outputs
 USUAL = 1 / 4  # of the highest price: most often it costs next to no error
 CHEAPER, PRICES = 4.0, 5  # how much lower the next price is that is tried, and how many are
 LITTLE = 1.25  # times the error of plain MPC
+QUICK = 12  # planned moves, up to which a search takes a moment
 LARGEST_WEIGHT = 1e9
 LEVEL_TAKES = 20  # samples behind dead times in which a level goes as far as all its inputs can move it
 PLANNED = {1: 5, 2: 5, 3: 4}  # samples with moves, of so many inputs; 3 of more
@@ -96,7 +96,7 @@ def _usual_price(
     still move, which is much beside the error of plain MPC where some modes are fast and others slow.
     """
     model, prices = problem.model, [highest * USUAL / CHEAPER**k for k in range(PRICES)]
-    if problem.control_horizon * model.n_inputs > FEW:
+    if problem.control_horizon * model.n_inputs > QUICK:
         return prices[0]
     reference, estimator = model.y_op + np.repeat(changes, every, axis=0), KalmanFilter.offset_free(model)
 

@@ -26,6 +26,7 @@ from mampc.program.restriction import by_count, excess_table
 from mampc.program.sample import Indices, LaterData, LeastSquares, Optimum, PatternOptimum, Sample
 
 LARGEST_TABLE = 1_000_000  # entries; from here on the tree search is faster
+LARGEST_BESIDE_DATA = 4_000_000  # where plans count on later data, which leave the bounds of a tree weak
 CACHE_BYTES = 64e6
 
 
@@ -155,8 +156,10 @@ class Ranking:
         return kept.at(sample)
 
 
-def ranking_of(condensed: CondensedQP, admissible: AdmissiblePatterns) -> Ranking | None:
-    """The table, or None where there are too many patterns for it."""
+def ranking_of(
+    condensed: CondensedQP, admissible: AdmissiblePatterns, largest: int | None = None
+) -> Ranking | None:
+    """The table, or None where there are too many patterns for it; `largest`: in entries."""
     products = condensed.n_moves * (condensed.n_moves + 1) // 2
-    patterns = admissible.listed(LARGEST_TABLE // products)
+    patterns = admissible.listed((LARGEST_TABLE if largest is None else largest) // products)
     return None if patterns is None else Ranking(condensed, admissible, patterns)

@@ -13,6 +13,7 @@ bounds.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -23,7 +24,7 @@ from mampc.base.errors import MampcError
 from mampc.base.tolerances import INSIDE, TIE, tie
 from mampc.base.words import Remark, Status
 from mampc.methods.exact.open_patterns import OpenPatterns
-from mampc.methods.exact.ranking import Ranking, ranking_of
+from mampc.methods.exact.ranking import LARGEST_BESIDE_DATA, Ranking, ranking_of
 from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.tree import PatternTree
 from mampc.methods.method import HELD_BY, Plan
@@ -92,6 +93,18 @@ class ExactSearch:
         self._relaxation: Relaxation | None = None
         if self._ranking is not None and condensed.bounds.every_move:
             self._relaxation = Relaxation(condensed, np.arange(condensed.n_moves), condensed.U)
+
+    def beside_later_data(self) -> ExactSearch:
+        """This search for plans that count on later data: by a table where a tree would find no proof in time."""
+        searched_as_tree = self._free is None and self._ranking is None and not self.admissible.sized
+        if not searched_as_tree or self.condensed.bounds.zones is not None:
+            return self
+        ranking = ranking_of(self.condensed, self.admissible, LARGEST_BESIDE_DATA)
+        if ranking is None:
+            return self
+        listing = copy(self)
+        listing._ranking = ranking
+        return listing
 
     @property
     def has_table(self) -> bool:
