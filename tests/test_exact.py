@@ -382,8 +382,7 @@ def test_every_pattern_takes_the_best_multipliers_between_new_and_earlier_ones()
     open_ = OpenPatterns(table, sample, past, without.copy())
     for multipliers in shown:
         open_.price(condensed.priced(sample, multipliers), np.inf)
-    taken = [0 * shown[0], *shown]
-    ends = [(new, taken[j]) for i, new in enumerate(taken) for j in range(i + 1)]
+    ends = [(new, shown[j]) for i, new in enumerate(shown) for j in range(i + 1)]
     between = [new + s * (old - new) for new, old in ends for s in np.linspace(0, 1, 501)]
     best = np.max([without, *(table.priced(condensed.priced(sample, m), past) for m in between)], axis=0)
     np.testing.assert_allclose(open_.bounds, best, rtol=1e-3)  # of a grid

@@ -36,11 +36,12 @@ class OpenPatterns:
     """
 
     def __init__(self, ranking: Ranking, sample: Sample, past: Allowance, bounds: Array) -> None:
-        self._ranking, self._sample = ranking, sample
+        self._ranking, self._sample, self._past = ranking, sample, past
         self._of_table = ranking.rows(past)
         self.rows: Indices = np.arange(self._of_table.start, self._of_table.start + len(bounds))
         self.bounds = bounds
-        # All of these once multipliers are priced in: the open part of the table and prices; per multipliers
+        self._first: LeastSquares | None = None  # with the first multipliers priced in
+        # All of these once others are priced in, too: the open part of the table and prices; per multipliers
         # (x, D, level); and per multipliers and pattern the bound, its price aside.
         self._table: Array | None = None
         self._charge: Array
@@ -65,10 +66,18 @@ class OpenPatterns:
         self.bounds[at] = np.inf
 
     def price(self, cost: LeastSquares, cutoff: float) -> None:
-        """Bound with other multipliers as well; patterns that cannot cost less than the cutoff are left out."""
+        """Bound with other multipliers as well; patterns that cannot cost less than the cutoff are left out.
+
+        The first ones count alone: often they are enough, and what the way between several takes is never needed.
+        """
+        if self._first is None:
+            self._first = cost
+            bounds = self._ranking.priced(cost, self._past, self._sample.later_data)
+            np.maximum(self.bounds, bounds, out=self.bounds)
+            return
         open_ = self.bounds < cutoff
         if self._table is None:
-            self._begin(open_)
+            self._begin(open_, self._first)
         elif 2 * np.count_nonzero(open_) < len(open_):
             self.rows, self.bounds, self._charge = self.rows[open_], self.bounds[open_], self._charge[open_]
             self._table, self._values = self._table[open_], self._values[:, open_]
@@ -82,20 +91,18 @@ class OpenPatterns:
         values += self._charge
         np.maximum(self.bounds, values, out=self.bounds)
 
-    def _begin(self, open_: BoolArray) -> None:
-        """Take the open patterns' part of the table, and no multipliers as the first ones."""
+    def _begin(self, open_: BoolArray, first: LeastSquares) -> None:
+        """Take the open patterns' part of the table, and the first multipliers as earlier ones."""
         ranking, sample = self._ranking, self._sample
-        without = ranking.excess(sample.moves, self._of_table)
         if 2 * np.count_nonzero(open_) < len(open_):
-            self.rows, self.bounds, without = self.rows[open_], self.bounds[open_], without[open_]
+            self.rows, self.bounds = self.rows[open_], self.bounds[open_]
             self._table = ranking.squares[self.rows]
         else:
             self._table = ranking.squares[self._of_table]
         self._charge = ranking.charges(self.rows, sample.later_data)
-        x = ranking.scaled(sample.least_squares)
-        self._held = np.concatenate((x, np.zeros(len(x)), (sample.cost,)))[None]
-        self._values = without[None] + sample.cost
-        self._rounding = 2 * ranking.rounding(x)
+        self._held, self._values = np.empty((0, 2 * len(sample.target) + 1)), np.empty((0, len(self.rows)))
+        self._rounding = 0.0
+        self._take(first)
 
     def _take(self, cost: LeastSquares) -> tuple[Array, Array]:
         """Take up multipliers; what patterns cost at least with them, and how much more on the way to earlier ones."""
@@ -124,4 +131,4 @@ class OpenPatterns:
         slope *= share
         self._held = np.concatenate((self._held, new[None]))
         self._values = np.concatenate((self._values, value[None]))
-        return value - self._rounding, np.maximum(np.maximum.reduce(slope), 0.0)
+        return value - self._rounding, np.maximum.reduce(slope, initial=0.0)

@@ -96,12 +96,6 @@ class Ranking:
             values[(self.patterns[rows] & ~self.admissible.open(past)).any(axis=1)] = np.inf
         return values
 
-    def excess(self, free: Array, rows: slice) -> Array:
-        """What optima without limits cost more than the free one, shape (rows,)."""
-        x = free * self.condensed.lengths
-        values: Array = self.table[rows].dot(x.take(self._rows) * x.take(self._columns))
-        return values
-
     def priced(self, cost: LeastSquares, past: Allowance, later_data: LaterData | None = None) -> Array:
         """The same with the limits priced in."""
         return self.bounds(self.condensed.plain.optimum(cost.target), cost.least, past, later_data)
