@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -89,13 +90,13 @@ def test_what_is_finished_is_not_run_again(swept, tmp_path, monkeypatch):
 def test_a_killed_sweep_loses_nothing_that_had_finished(tmp_path):
     (tmp_path / "small.toml").write_text(small_text())
     command = [
-        sys.executable, "-m", "mampc", "sweep", "small.toml", "--seeds", "2", "--points", "3", "--jobs", "1",
+        sys.executable, "-m", "mampc", "sweep", "small.toml", "--seeds", "1", "--points", "2", "--jobs", "1",
         "--out", "out",
     ]  # fmt: skip
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
     journal = tmp_path / "out" / "sweep.jsonl"
     while process.poll() is None and not (journal.exists() and journal.read_text().count("task") >= 2):
-        pass
+        time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.wait()
     finished = journal.read_text().count('"task"')
@@ -134,12 +135,20 @@ def test_results_of_another_study_are_refused(swept, tmp_path):
         run_sweep(Sweep(small(steps=26), seeds=3, points=3), tmp_path)
 
 
-def test_a_scheduler_that_is_not_there_is_told_in_one_sentence(swept, tmp_path):
+def test_a_scheduler_that_is_not_there_is_told_in_one_sentence(swept, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra mampc[cluster]")
+    monkeypatch.setattr("mampc.compare.sweep.SCHEDULER_SECONDS", 0.3)
     with pytest.raises(mampc.MampcError, match=r"expected a Dask scheduler at .tcp"):
         run_sweep(swept[0], tmp_path, scheduler="tcp://127.0.0.1:9")
 
 
+def test_a_cluster_gives_the_same_rows(swept, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra mampc[cluster]")
+    with distributed.LocalCluster(n_workers=1, dashboard_address=None, processes=False) as cluster:
+        assert run_sweep(swept[0], tmp_path, scheduler=cluster.scheduler_address) == swept[2]
+
+
+@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_the_same_rows(swept, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra mampc[cluster]")
     with distributed.LocalCluster(
