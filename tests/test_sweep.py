@@ -87,13 +87,12 @@ def test_what_is_finished_is_not_run_again(swept, tmp_path, monkeypatch):
     assert run_sweep(sweep, tmp_path, jobs=1) == rows
 
 
-def test_a_killed_sweep_loses_nothing_that_had_finished(tmp_path):
+def test_a_killed_sweep_loses_nothing_that_had_finished(tmp_path, monkeypatch):
     (tmp_path / "small.toml").write_text(small_text())
-    command = [
-        sys.executable, "-m", "mampc", "sweep", "small.toml", "--seeds", "1", "--points", "2", "--jobs", "1",
-        "--out", "out",
-    ]  # fmt: skip
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
+    command = ["sweep", "small.toml", "--seeds", "1", "--points", "2", "--jobs", "1", "--out", "out"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mampc", *command], cwd=tmp_path, stderr=subprocess.DEVNULL
+    )
     journal = tmp_path / "out" / "sweep.jsonl"
     while process.poll() is None and not (journal.exists() and journal.read_text().count("task") >= 2):
         time.sleep(0.02)
@@ -101,8 +100,8 @@ def test_a_killed_sweep_loses_nothing_that_had_finished(tmp_path):
     process.wait()
     finished = journal.read_text().count('"task"')
     assert finished >= 2
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert f"{finished} of" in done.stderr
+    monkeypatch.chdir(tmp_path)
+    assert f"{finished} of" in CliRunner().invoke(app, command, catch_exceptions=False).stderr
     assert (tmp_path / "out" / "sweep.csv").read_text().startswith("scenario,controller")
 
 
