@@ -271,7 +271,8 @@ class PatternSolver:
             return OnPattern(None, objective, QPStatus.OPTIMAL, multipliers, 1)
         moves: Array = np.zeros(self.condensed.n_moves)
         moves[pattern] = chosen
-        if (np.abs(chosen) < ROUNDING * self.condensed.move_prefix[pattern]).any():
+        small = np.abs(chosen) < ROUNDING * self.condensed.move_prefix[pattern]
+        if small.any() and (self.admissible.priced or chosen[small].any()):
             moves = without_rounding(self.condensed, sample, moves)
             # With later data the pattern counts: what these will decide may be nothing as yet.
             if sample.later_data is None:

@@ -189,27 +189,27 @@ class ExactSearch:
         """Patterns of the table best bound first, bounded anew whenever a program shows other multipliers."""
         best, deadline, condensed = Incumbent(), self._deadline(), self.condensed
         rounding, open_ = condensed.rounding(sample), OpenPatterns(ranking, sample, past, bounds)
-        if sample.margins.min(initial=np.inf) < 0:
+        cutoff, margins = np.inf, sample.margins
+        if len(margins) and margins[margins.argmin()] < 0:
             plain = condensed.plain.nearest(sample.target, sample.both_bounds)
             first = solver.priced(sample, plain.multipliers)
             if first is not None:
-                open_.price(first, np.inf)
+                open_.price(first, cutoff)
         relaxation = None if self._relaxation is None else self._relaxation.at(sample, sample.moves)
-        while True:
-            at, bound = open_.best()
-            if bound == np.inf or bound >= best.objective - tie(best.objective, rounding):
-                return self._plan(sample, best, best.objective)
+        at, bound = open_.best()
+        while not bound >= cutoff:
             if perf_counter() > deadline:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
             pattern = ranking.patterns[open_.rows[at]]
             solved = solver.solve(sample, pattern, best.objective, deadline, paid=self.admissible.priced)
-            best.offer(solved, bound)
+            if best.offer(solved, bound):
+                cutoff = best.objective - tie(best.objective, rounding)
             if solved.status is QPStatus.TIME_LIMIT:
                 return self._plan(sample, best, bound, Status.TIME_LIMIT)
             open_.close(at)
-            cutoff = best.objective - tie(best.objective, rounding)
-            if open_.best()[1] >= cutoff:
-                continue
+            at, bound = open_.best()
+            if bound >= cutoff:
+                break
             limits = solver.priced(sample, solved.multipliers)
             if limits is not None:
                 open_.price(limits, cutoff)
@@ -219,6 +219,8 @@ class ExactSearch:
                     together = solver.priced(sample, relaxation.with_moves(sample, made))
                     if together is not None:
                         open_.price(together, cutoff)
+                at, bound = open_.best()
+        return self._plan(sample, best, best.objective)
 
     def _search_tree(self, sample: Sample, past: Allowance, solver: PatternSolver) -> Plan:
         best = Incumbent()
