@@ -73,7 +73,7 @@ def test_a_record_without_feedback_is_known_as_such(seed):
     u = prbs(order=9, hold=6, samples=1500, seed=seed)
     y = model.response(u) + 0.1 * rng.standard_normal((1500, 1))
     assert not under_feedback(scaled([IOData(u, y, 1.0)]))
-    assert under_feedback(scaled([record_of("with a lag", seed)]))
+    assert under_feedback(scaled([record_of("with a lag", seed, noise=0.2)]))
 
 
 def test_a_controller_on_the_model_of_an_unstable_plant_holds_it():

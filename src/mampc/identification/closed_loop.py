@@ -28,7 +28,26 @@ MOST = 8  # states
 
 
 def under_feedback(records: Scaled) -> bool:
-    """Whether past outputs say something of the inputs beside their own past: a likelihood ratio test."""
+    """Whether past disturbances say something of the inputs beside their own past.
+
+    Disturbances are what a long vector ARX model does not predict of the outputs. Outputs themselves also tell of
+    inputs long ago, which say more of a held signal than its last values do.
+    """
+    return _tells(_innovations(records, _lags(records)))
+
+
+def _innovations(records: Scaled, lags: int) -> Scaled:
+    """The records with what a vector ARX model leaves of the outputs in their place."""
+    theta = _predictors(records, lags, feedthrough=False)[0]
+    kept = [(u, y) for u, y in zip(records.u, records.y, strict=True) if len(u) > 2 * lags + 1]
+    left = [y[lags:] - np.hstack(_past(u, y, lags)) @ theta for u, y in kept]
+    return records.replaced([u[lags:] for u, _ in kept], left)
+
+
+def _tells(records: Scaled) -> bool:
+    """Whether the past of the outputs says something of the inputs beside their own: a likelihood ratio test."""
+    if not records.u:
+        return False
     lags = _lags(records)
     m, l = records.u[0].shape[1], records.y[0].shape[1]
     factor = _regression(records.u, records.y, lags, target="u", feedthrough=False)
@@ -48,7 +67,12 @@ def under_feedback(records: Scaled) -> bool:
 
 
 def certainly_unstable(records: Scaled, feedthrough: bool, order: int | None) -> bool:
-    """Whether poles lie outside the unit circle by more than what leaving out parts of the records changes."""
+    """Whether past outputs say something of the inputs, and poles lie outside the unit circle for certain.
+
+    For certain: by more than what leaving out parts of the records changes.
+    """
+    if not _tells(records):
+        return False
     A, _, _, n = _dynamics(records, feedthrough, order)
     size = np.abs(np.linalg.eigvals(A)).max()
     if size <= 1.0:
@@ -84,11 +108,7 @@ def _predicted(A: Array, C: Array, K: Array, records: Scaled, feedthrough: bool)
 def _dynamics(records: Scaled, feedthrough: bool, order: int | None) -> tuple[Array, Array, Array, int]:
     """A, C, K and the order, from the Hankel matrix of the predictor's Markov parameters."""
     m, l, lags = records.u[0].shape[1], records.y[0].shape[1], _lags(records)
-    factor = _regression(records.u, records.y, lags, target="y", feedthrough=feedthrough)
-    size = factor.shape[1] - l
-    theta = np.column_stack(
-        [solve(np.column_stack([factor[:, :size], factor[:, size + i]])) for i in range(l)]
-    )
+    theta, factor = _predictors(records, lags, feedthrough=feedthrough)
     own = theta[: lags * (m + l)]
     blocks = np.concatenate(
         [own[: lags * m].reshape(lags, m, l), own[lags * m :].reshape(lags, l, l)], axis=1
@@ -127,6 +147,20 @@ def _lags(records: Scaled) -> int:
     return int(max(2, min(PAST, records.samples // (10 * (m + l)))))
 
 
+def _predictors(records: Scaled, lags: int, *, feedthrough: bool) -> tuple[Array, Array]:
+    """Coefficients of a vector ARX model, a column per output, and the triangular factor they were found from."""
+    factor = _regression(records.u, records.y, lags, target="y", feedthrough=feedthrough)
+    size = factor.shape[1] - records.y[0].shape[1]
+    columns = [solve(np.column_stack([factor[:, :size], target])) for target in factor[:, size:].T]
+    return np.column_stack(columns), factor
+
+
+def _past(u: Array, y: Array, lags: int) -> list[Array]:
+    """Inputs 1..lags samples ago, then outputs, from the first sample with a whole past on."""
+    N = len(u) - lags
+    return [signal[lags - i : lags - i + N] for signal in (u, y) for i in range(1, lags + 1)]
+
+
 def _regression(
     u: Sequence[Array], y: Sequence[Array], lags: int, *, target: str, feedthrough: bool
 ) -> Array:
@@ -136,10 +170,9 @@ def _regression(
         N = len(inputs) - lags
         if N <= 1:
             continue
-        past = [signal[lags - i : lags - i + N] for signal in (inputs, outputs) for i in range(1, lags + 1)]
         now = [inputs[lags:]] if feedthrough else []
         rows = np.concatenate(
-            [np.ones((N, 1)), *past, *now, (inputs if target == "u" else outputs)[lags:]], axis=1
+            [np.ones((N, 1)), *_past(inputs, outputs, lags), *now, (inputs if target == "u" else outputs)[lags:]], axis=1
         )
         reduced = fold(np.empty((0, rows.shape[1])), rows)[1:, 1:]
         factor = fold(factor if factor.size else np.empty((0, reduced.shape[1])), reduced)

@@ -156,6 +156,7 @@ def _likeliest(
     if len(coarse) == 1:
         return coarse[0]
 
+    @cache
     def variance(n: int) -> Array:
         mean: Array = np.mean(np.concatenate(left(n)) ** 2, axis=0)
         return np.log(np.maximum(mean, ROUNDING**2))

@@ -151,7 +151,7 @@ def n4sid(
     tell = progress if progress is not None else (lambda stage: None)
     values: list[Array] = []
     feedback = detrend != "none" and _under_feedback(records)
-    if unstable == "auto" and dead is None and feedback and _keeps_unstable(records, settings):
+    if unstable == "auto" and dead is None and detrend != "none" and _keeps_unstable(records, settings):
         choice = Choice("constant", np.zeros((l, m), dtype=int), predictor=True, notes=(UNSTABLE,))
         part, errors_ahead = estimate_predictor(records, feedthrough, order)
         parts, noise = [part], Noise(np.maximum(errors_ahead, LEAST_NOISE) * records.y_spread, np.zeros(l))
