@@ -76,6 +76,17 @@ def test_a_record_without_feedback_is_known_as_such(seed):
     assert under_feedback(scaled([record_of("with a lag", seed, noise=0.2)]))
 
 
+@pytest.mark.parametrize("seed", seeds(4, quick=1))
+def test_held_test_signals_are_not_taken_for_feedback(seed):
+    """Outputs tell of inputs longer ago than their own last values, and so of when a held signal may move."""
+    plant = mampc.StateSpace.from_first_order(
+        gain=np.ones((3, 2)), time_constant=np.array([[4, 30], [10, 20], [40, 6]]), dead_time=0.0, dt=1.0
+    )
+    u = prbs(order=10, hold=10, inputs=2, samples=2000, seed=seed)
+    noise = lfilter([0.1], [1.0, -0.9], np.random.default_rng(seed).standard_normal((2000, 3)), axis=0)
+    assert not under_feedback(scaled([IOData(u, plant.response(u) + noise, 1.0)]))
+
+
 def test_a_controller_on_the_model_of_an_unstable_plant_holds_it():
     model = n4sid(record_of("with a lag", 0), feedthrough=False).model
     A, B, C, _ = map(np.array, PLANTS["with a lag"])

@@ -18,11 +18,9 @@ from mampc.identification.estimate import Settings, estimate
 from mampc.identification.fir import estimate_fir
 from mampc.identification.held_out import (
     AS_GOOD,
-    CLEARLY,
+    CHANCE,
     NOTHING,
     RIVAL,
-    ROOT,
-    WALK,
     Errors,
     compared,
     errors,
@@ -36,12 +34,11 @@ TRENDS = {
     "constant": "constants were fitted",
     "linear": "a line in time was fitted to each output",
     "differences": "changes were explained, as outputs that drift ask for",
-    "whitened": "disturbances were made white first, as their colour or a loop that was closed ask for",
+    "whitened": "disturbances were made white first, as drifts, slow waves or a loop that was closed ask for",
 }
 ENOUGH = 20_000  # samples in which choices are compared
 SHORT = 3  # samples of dead time that are left to the states
-WALKING = ("differences", "whitened")  # what to take first where what is left may walk
-CHANCE = 4.0  # difference of log likelihoods that chance brings
+WALKING = ("whitened", "differences")  # where what is left is slow
 RIVALS = ("ARX", "FIR")  # for the poles of subspace models
 
 
@@ -103,7 +100,8 @@ def chosen(
     found = find_delays(records.u, records.y) if delays is None else delays
     if delays is None and found.max() <= SHORT:
         found = none
-    front, back = split(records.shortened(ENOUGH))
+    compared_on = records.shortened(ENOUGH)
+    front, cuts = split(compared_on)
     notes: list[str] = []
 
     def scored(choice: Choice) -> Score:
@@ -116,45 +114,25 @@ def chosen(
             parts = estimated(front, trial, choice)
         except (MampcError, np.linalg.LinAlgError):
             return Score(NOTHING, 0)
-        return Score(errors(parts, back), sum(part.integrators for part in parts))
+        return Score(errors(parts, compared_on, cuts), sum(part.integrators for part in parts))
 
-    trends = ("constant", "linear", "differences") if detrend == "auto" else (detrend,)
+    trends = ("constant", "linear") if detrend == "auto" else (detrend,)
     choices = [Choice(trend, found) for trend in trends]
     scores = [scored(choice) for choice in choices]
-    # White disturbances come with orders of their own, where none is asked for.
-    if detrend == "auto" and (feedback or (settings.order is None and scores[0].errors.walk > WALK)):
-        trends = (*trends, "whitened")
-        choices.append(Choice("whitened", found))
-        scores.append(scored(choices[-1]))
     # Where inputs excite too little for anything else, white disturbances say nothing.
-    telling = [score for trend, score in zip(trends, scores, strict=True) if trend != "whitened"] or scores
-    if not any(np.isfinite(score.errors.ahead) for score in telling):
+    if not any(np.isfinite(score.errors.ahead) for score in scores):
         why = "Too short to hold a part out, so that nothing was compared"
         return Choice(trends[0], none if delays is None else found, notes=(f"{why}: {TRENDS[trends[0]]}.",))
-    # A drift passes for an integrator that inputs hardly move: the fewest of these win among those that predict alike.
-    # Where what is left may walk, levels say little: changes are explained. Elsewhere constants stand unless others are
-    # clearly better: then what predicts best wins, the simplest of what chance cannot tell apart.
-    # Levels say nothing under feedback: inputs answer disturbances.
-    first = scores[0].errors
-
-    def is_fair(found: Errors) -> bool:
-        if feedback:
-            return bool(np.isfinite(found.ahead))
-        return found.level <= first.level + CLEARLY or found.ahead < first.ahead - CLEARLY
-
-    def rank(k: int) -> tuple[bool, int]:
-        return feedback and trends[k] != "whitened", scores[k].integrators
-
-    near = _within(AS_GOOD, [k for k in range(len(trends)) if k == 0 or is_fair(scores[k].errors)], scores)
-    near = [k for k in near if rank(k) == min(map(rank, near))]
-    walks = first.walk > WALK and max(scores[k].errors.root for k in near) > ROOT
-    changes = [k for name in WALKING for k in near if trends[k] == name]
-    if walks and changes:
-        best = changes[0]
-    elif rank(0) == rank(near[0]) and first.ahead <= min(scores[k].errors.ahead for k in near) + RIVAL:
-        best = 0
-    else:
-        best = _within(min(AS_GOOD, CHANCE / (l * back.samples)), near, scores)[0]
+    preferred: tuple[str, ...] = ()
+    if detrend == "auto":
+        preferred = WALKING if scores[0].errors.slow else WALKING[:1] if feedback else ()
+        if settings.order is not None and not feedback:  # white disturbances come with orders of their own
+            preferred = preferred[1:]
+        trends = (*trends, *preferred)
+        choices += [Choice(trend, found) for trend in preferred]
+        scores += [scored(choice) for choice in choices[len(scores) :]]
+    alike = min(AS_GOOD, CHANCE / (l * (compared_on.samples - front.samples)))
+    best = _best(trends, scores, preferred, alike, feedback)
     choice, score = choices[best], scores[best].errors.ahead
     said = f"Trend: {TRENDS[choice.trend]}"
     if feedback:
@@ -184,10 +162,34 @@ def chosen(
     return replace(choice, notes=tuple(notes))
 
 
-def _within(margin: float, candidates: Sequence[int], scores: Sequence[Score]) -> list[int]:
-    """Those of the candidates whose errors are no larger than the least by more than a margin."""
-    least = min(scores[k].errors.ahead for k in candidates)
-    return [k for k in candidates if scores[k].errors.ahead <= least + margin]
+def _best(
+    trends: Sequence[str], scores: Sequence[Score], preferred: Sequence[str], alike: float, feedback: bool
+) -> int:
+    """Which trend: constants, unless others are preferred or better.
+
+    Preferred ones are taken, the first of those that are alike, unless others predict clearly better or constants
+    explain held-out levels better for certain. Levels say nothing under feedback: inputs answer disturbances.
+
+    Otherwise a drift passes for an integrator that inputs hardly move: the fewest of these win among those that predict
+    alike, and constants among these unless others are clearly better.
+    """
+    ahead = [score.errors.ahead for score in scores]
+    fair = [
+        k
+        for k, trend in enumerate(trends)
+        if trend in preferred
+        and ahead[k] <= min(ahead) + RIVAL
+        and (feedback or not scores[0].errors.excludes(scores[k].errors))
+    ]
+    if fair:
+        least = min(ahead[k] for k in fair)
+        return next(k for k in fair if ahead[k] <= least + alike)
+    near = [k for k, trend in enumerate(trends) if trend not in preferred]
+    near = [k for k in near if ahead[k] <= min(ahead[k] for k in near) + AS_GOOD]
+    fewest = min(scores[k].integrators for k in near)
+    near = [k for k in near if scores[k].integrators == fewest]
+    constant = scores[0].integrators == fewest and ahead[0] <= ahead[near[0]] + RIVAL
+    return 0 if constant else near[0]
 
 
 def block_rows_for(samples: list[int], m: int, l: int, order: int | None, block_rows: int | None) -> int:

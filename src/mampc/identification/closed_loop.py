@@ -37,10 +37,13 @@ def under_feedback(records: Scaled) -> bool:
 
 
 def _innovations(records: Scaled, lags: int) -> Scaled:
-    """The records with what a vector ARX model leaves of the outputs in their place."""
-    theta = _predictors(records, lags, feedthrough=False)[0]
+    """The records with what a vector ARX model leaves of the outputs in their place.
+
+    It knows the present inputs: what these do at once is no disturbance.
+    """
+    theta = _predictors(records, lags, feedthrough=True)[0]
     kept = [(u, y) for u, y in zip(records.u, records.y, strict=True) if len(u) > 2 * lags + 1]
-    left = [y[lags:] - np.hstack(_past(u, y, lags)) @ theta for u, y in kept]
+    left = [y[lags:] - np.hstack([*_past(u, y, lags), u[lags:]]) @ theta for u, y in kept]
     return records.replaced([u[lags:] for u, _ in kept], left)
 
 
@@ -172,7 +175,13 @@ def _regression(
             continue
         now = [inputs[lags:]] if feedthrough else []
         rows = np.concatenate(
-            [np.ones((N, 1)), *_past(inputs, outputs, lags), *now, (inputs if target == "u" else outputs)[lags:]], axis=1
+            [
+                np.ones((N, 1)),
+                *_past(inputs, outputs, lags),
+                *now,
+                (inputs if target == "u" else outputs)[lags:],
+            ],
+            axis=1,
         )
         reduced = fold(np.empty((0, rows.shape[1])), rows)[1:, 1:]
         factor = fold(factor if factor.size else np.empty((0, reduced.shape[1])), reduced)

@@ -125,8 +125,8 @@ def n4sid(
             them where a record taken under feedback shows them for certain, and mirrors them elsewhere.
         detrend: "none" explains the signals as they are, "constant" (beside the means) and "linear" fit a
             constant or a line in time to each output of each record, "differences" explains changes from
-            sample to sample, "whitened" makes disturbances white first, one output after the other; "auto" takes what
-            predicts held-out data best, the simplest if that is alike, "whitened" if outputs moved the inputs.
+            sample to sample, "whitened" makes disturbances white first, one output after the other; "auto" takes
+            constants unless what they leave is slow, disturbances moved the inputs, or a line predicts better.
         delays: dead times in samples, beyond the one of every sampled plant, a scalar or (l, m + d); by
             default those that show in the record, if they exceed `SHORT` and predict held-out data.
         progress: is told each stage in a few words; long records with many signals take some seconds.

@@ -7,13 +7,15 @@ outputs linearly. The outputs of (A, e_i, C) are first-order filters in a row on
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.identification.modes import Modes, modes
 from mampc.identification.scaling import Scaled
-from mampc.identification.triangular import fold, solve
+from mampc.identification.triangular import fold, solve, span
 
 _CORRELATED = 2**16  # samples whose autocorrelation is looked at
 _ENTRIES = 2**20  # numbers taken into the triangular factor at once, 8 MB
@@ -63,12 +65,19 @@ def fit_inputs(
     common = n * m + (l * m if feedthrough else 0)
     factor: Array = np.empty((0, common + 1))
     heads = []
+    found = modes(A, C, q) if l > 1 else None  # a single output has no others to share signals with
     for u, y in zip(records.u, records.y, strict=True):
-        R: Array = np.empty((0, own + common + 1))
-        for rows in _rows(A, C, u, y, feedthrough, degree, directions, drives):
-            R = fold(R, rows)
-        heads.append(R[:own])
-        factor = fold(factor, R[own:, own:])
+        if found is not None:
+            head = _shared_rows(found, u, y, feedthrough, degree, directions, drives)
+            explained = span(head[:, :own])
+            factor = fold(factor, head[:, own:] - explained @ (explained.T @ head[:, own:]))
+        else:
+            R: Array = np.empty((0, own + common + 1))
+            for rows in _rows(A, C, u, y, feedthrough, degree, directions, drives):
+                R = fold(R, rows)
+            head = R[:own]
+            factor = fold(factor, R[own:, own:])
+        heads.append(head)
     theta = solve(factor)
     error = float(np.linalg.norm(factor[:, -1] - factor[:, :-1] @ theta))
     trends = []
@@ -97,18 +106,9 @@ def _rows(
 ) -> Iterator[Array]:
     """Blocks of equations: x0, polynomial, drive, B, D, and the right-hand side; l rows per sample."""
     (l, n), (N, m) = C.shape, u.shape
-
-    def signals(rows: slice) -> Array:
-        """One sample at the start, the inputs a sample ago, and a constant that adds up to one."""
-        block = np.zeros((rows.stop - rows.start, m + 1 + (drives > 0)))
-        first = rows.start == 0
-        block[0, 0] = first
-        block[first:, 1 : 1 + m] = u[rows.start - 1 + first : rows.stop - 1]
-        block[first:, 1 + m :] = 1.0 / N
-        return block
-
+    p = m + 1 + (drives > 0)
     start = 0
-    for response in filtered(A, C, signals, (N, m + 1 + (drives > 0))):
+    for response in filtered(A, C, partial(_sources, u, p), (N, p)):
         count = len(response)
         chunk = slice(start, start + count)
         powers = _time(chunk, N)[:, None] ** np.arange(degree + 1)
@@ -123,6 +123,44 @@ def _rows(
         parts.append(y[chunk][..., None])
         yield np.concatenate(parts, axis=2).reshape(count * l, -1)
         start += count
+
+
+def _shared_rows(
+    found: Modes, u: Array, y: Array, feedthrough: bool, degree: int, directions: Array, drives: int
+) -> Array:
+    """Few equations that say the same: outputs are sums of the modes' signals, whose triangular factor serves all."""
+    (l, n), (N, m) = (y.shape[1], found.shares.shape[2]), u.shape
+    p = m + 1 + (drives > 0)
+    last: Array = np.zeros((len(found.poles), p))
+    R: Array = np.empty((0, n * p + degree + 1 + m + l))
+    block = max(1, _ENTRIES // (4 * n * p))
+    for start in range(0, N, block):
+        rows = slice(start, min(start + block, N))
+        signals, last = found.signals(_sources(u, p, rows), last)
+        powers = _time(rows, N)[:, None] ** np.arange(degree + 1)
+        R = fold(R, np.concatenate([signals, powers, u[rows], y[rows]], axis=1))
+    count, at = len(R), n * p + degree + 1
+    response = np.einsum("krp,lrs->klsp", R[:, : n * p].reshape(count, n, p), found.shares)
+    parts = [
+        response[..., 0],
+        np.einsum("kd,lc->kldc", R[:, n * p : at], directions).reshape(count, l, -1),
+        response[:, :, :drives, -1],
+        response[..., 1 : 1 + m].reshape(count, l, n * m),
+    ]
+    if feedthrough:
+        parts.append(np.einsum("op,kj->kopj", np.eye(l), R[:, at : at + m]).reshape(count, l, l * m))
+    parts.append(R[:, at + m :, None])
+    return np.concatenate(parts, axis=2).reshape(count * l, -1)
+
+
+def _sources(u: Array, p: int, rows: slice) -> Array:
+    """What moves states: one sample at the start, the inputs a sample ago, and a constant that adds up to one."""
+    m, first = u.shape[1], rows.start == 0
+    block = np.zeros((rows.stop - rows.start, p))
+    block[0, 0] = first
+    block[first:, 1 : 1 + m] = u[rows.start - 1 + first : rows.stop - 1]
+    block[first:, 1 + m :] = 1.0 / len(u)
+    return block
 
 
 def filtered(A: Array, C: Array, signals: Signals, shape: tuple[int, int]) -> Iterator[Array]:

@@ -18,3 +18,10 @@ def solve(R: Array) -> Array:
     scale[scale == 0.0] = 1.0  # units of the columns must not matter to what counts as dependent
     solution: Array = np.linalg.lstsq(R[:, :-1] / scale, R[:, -1], rcond=1e-12)[0] / scale
     return solution
+
+
+def span(columns: Array) -> Array:
+    """An orthonormal basis of what columns span, whatever their units."""
+    scale = np.linalg.norm(columns, axis=0)
+    left, size, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    return left[:, size > 1e-12 * size.max(initial=0.0)]
