@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from mampc import IOData, MampcError, StateSpace, n4sid, prbs
+from mampc.identification.delays import find_delays
 from seeds import deep, examples, seeds
 
 UNITS = [(1e-4, 1e5), *deep((1.0, 1.0))]
@@ -263,3 +264,12 @@ def test_an_order_that_is_asked_for_is_kept_where_disturbances_are_made_white():
     u = np.repeat(rng.choice([-1.0, 1.0], (100, 1)), 5, axis=0)
     data = IOData(u, plant.response(u) + 0.1 * rng.standard_normal((500, 1)), 1.0)
     assert n4sid(data, detrend="whitened", order=2).order == 2
+
+
+def test_an_input_that_stands_still_has_no_dead_time():
+    rng = np.random.default_rng(0)
+    u = np.column_stack([rng.standard_normal(500), np.zeros(500)])
+    y = lfilter([0.0] * 8 + [1.0], [1.0, -0.8], u[:, :1], axis=0)
+    delays = find_delays([u], [y + 0.01 * rng.standard_normal(y.shape)])
+    assert abs(delays[0, 0] - 7) <= 1
+    assert delays[0, 1] == 0

@@ -108,3 +108,15 @@ def test_records_too_short_for_impulse_responses_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(MampcError, match="expected records that hold impulse responses"):
         impulse_responses(scaled([IOData(rng.standard_normal(7), rng.standard_normal(7), 1.0)]), 0)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_inputs_that_excite_next_to_nothing_raise_nothing(unit):
+    """A sine through an integrator without noise leaves nothing positive definite but for rounding."""
+    u = (
+        np.sin(0.01 * np.arange(600))[:, None] * [1.0, 0.5]
+        + [0.0, 1.0] * np.sin(0.03 * np.arange(600))[:, None]
+    )
+    y = np.cumsum(u.sum(axis=1, keepdims=True), axis=0)
+    responses = impulse_responses(scaled([IOData(unit * u, y / unit, 1.0)]), 0)
+    assert np.isfinite(responses).all()

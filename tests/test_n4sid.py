@@ -395,3 +395,14 @@ def test_a_plant_that_is_not_linear_gets_states_enough():
     fitted = n4sid(record.estimation, feedthrough=False)
     assert fitted.detrend == "constant"
     assert fitted.validate(record.validation).fit[:3].min() > 50
+
+
+def test_what_cannot_be_computed_is_told_in_words(monkeypatch):
+    def fails(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(sys.modules["mampc.identification.n4sid"], "estimated", fails)
+    with pytest.raises(
+        MampcError, match=r"n4sid: expected records that a model .*Singular matrix; look for inputs"
+    ):
+        n4sid(noise_free(random_system(0, 2, 1, 1, False), 0))

@@ -96,7 +96,7 @@ def _delays_of_output(M: Array, count: int, m: int, lags: int, i: int, longest: 
 def _errors(M: Array, target: Integers, fixed: Integers, window: Integers, longest: int) -> Array:
     """The sum of squared errors with one input's window set back by 0..longest - 1 samples, shape (longest,)."""
     F = M[np.ix_(fixed, fixed)]
-    F = F + 1e-12 * np.diag(np.diag(F))
+    F = F + np.diag(_ridge(1e-12, np.diag(F)))
     solved = np.linalg.solve(F, M[fixed])  # what the fixed regressors take of everything
     places = np.arange(longest)[:, None] + window  # (longest, EACH)
     W = M[places[:, :, None], places[:, None, :]] - M[fixed][:, places].transpose(1, 2, 0) @ solved[
@@ -105,7 +105,13 @@ def _errors(M: Array, target: Integers, fixed: Integers, window: Integers, longe
     c = M[places, target[0]] - solved[:, places].transpose(1, 2, 0) @ M[fixed, target[0]]
     total = M[target[0], target[0]] - M[target[0], fixed] @ solved[:, target[0]]
     scale = np.einsum("kii->ki", M[places[:, :, None], places[:, None, :]])
-    W = W + 1e-10 * scale[:, :, None] * np.eye(len(window))
+    W = W + _ridge(1e-10, scale)[:, :, None] * np.eye(len(window))
     gain = np.einsum("ki,ki->k", c, np.linalg.solve(W, c[..., None])[..., 0])
     errors: Array = np.maximum(total - gain, 1e-12 * M[target[0], target[0]])
     return errors
+
+
+def _ridge(share: float, squares: Array) -> Array:
+    """A share of sums of squares; what stands still gets anything, which leaves it without a say."""
+    ridge: Array = np.where(squares > 0, share * squares, 1.0)
+    return ridge

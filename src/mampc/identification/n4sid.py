@@ -151,16 +151,25 @@ def n4sid(
     tell = progress if progress is not None else (lambda stage: None)
     values: list[Array] = []
     feedback = detrend != "none" and _under_feedback(records)
-    if unstable == "auto" and dead is None and detrend != "none" and _keeps_unstable(records, settings):
-        choice = Choice("constant", np.zeros((l, m), dtype=int), predictor=True, notes=(UNSTABLE,))
-        part, errors_ahead = estimate_predictor(records, feedthrough, order)
-        parts, noise = [part], Noise(np.maximum(errors_ahead, LEAST_NOISE) * records.y_spread, np.zeros(l))
-    else:
-        choice = chosen(records, settings, detrend, dead, feedback, tell)
-        tell("identifying a model on all of the record")
-        parts = estimated(records, settings, choice, values)
-        noise = _noise(parts, records)
-    model = replace(assembled(parts, records, first), noise=noise)
+    try:
+        if unstable == "auto" and dead is None and detrend != "none" and _keeps_unstable(records, settings):
+            choice = Choice("constant", np.zeros((l, m), dtype=int), predictor=True, notes=(UNSTABLE,))
+            part, errors_ahead = estimate_predictor(records, feedthrough, order)
+            parts, noise = (
+                [part],
+                Noise(np.maximum(errors_ahead, LEAST_NOISE) * records.y_spread, np.zeros(l)),
+            )
+        else:
+            choice = chosen(records, settings, detrend, dead, feedback, tell)
+            tell("identifying a model on all of the record")
+            parts = estimated(records, settings, choice, values)
+            noise = _noise(parts, records)
+        model = replace(assembled(parts, records, first), noise=noise)
+    except np.linalg.LinAlgError as failure:
+        raise MampcError(
+            f"n4sid: expected records that a model can be computed from, received ones with {failure}; "
+            "look for inputs that hardly move or move together, or give order and detrend"
+        ) from failure
     integrators = sum(part.integrators for part in parts)
     notes = list(choice.notes)
     if integrators:
