@@ -11,9 +11,6 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import listed
 from mampc.controllers.offset import HIGHEST_PRICE
-from mampc.loop.defaults import FEW
-from mampc.loop.doubt import runs_away
-from mampc.program.problem import TrackingProblem
 from mampc.study.draft import Draft, draft, rounded
 from mampc.systems.properties import Properties, properties, time_in_words
 from mampc.systems.state_space import StateSpace
@@ -79,7 +76,7 @@ output_weight = {_list(np.diag(problem.output_weight))}  # errors count by the c
 move_weight = {_list(np.diag(problem.move_weight))}  # by what inputs do to outputs
 # Limits of the inputs are {limit_note}.
 limits = {{ u_min = {_list(limits.u_min)}, u_max = {_list(limits.u_max)} }}  # also du_max, y_min, y_max
-{_output_ranges(model)}{_later_data(problem)}
+{_output_ranges(model)}
 [reference]
 relative = true  # from the operating outputs {_some(model.y_op)}
 initial = {_list(np.zeros(model.n_outputs))}
@@ -133,16 +130,6 @@ noise = {_list(plan.noise)}
 seed = 0
 # Outputs wandered like this in the record, by loads, drifts and what the model lacks: standard deviation in a sample.
 loads = [{{ kind = "random_walk", at = "output", size = {_list(rounded(model.noise.drift))} }}]
-"""
-
-
-def _later_data(problem: TrackingProblem) -> str:
-    """Where a search is quick, and nothing runs away from a plan that waits."""
-    if problem.control_horizon * problem.model.n_inputs > FEW or runs_away(problem.model):
-        return ""
-    return """
-[estimator]
-value_of_information = true  # plans count on later measurements: fewer moves at the same price
 """
 
 
