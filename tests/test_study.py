@@ -195,7 +195,7 @@ def test_the_summary_holds_what_is_promised(result):
 
 
 def test_the_files_of_a_run_can_be_read_back(tmp_path, monkeypatch):
-    names = ("prbs-inputs", "noisy_u1", "noisy_moves-against-error")
+    names = ("noisy_u1", "noisy_moves-against-error")
     monkeypatch.setattr(
         output, "study_figures", lambda result: (f for f in study_figures(result) if f.name in names)
     )

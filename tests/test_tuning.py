@@ -19,6 +19,7 @@ from mampc.study import load_study, parse_study
 from mampc.study.regulators import regulator_of
 from mampc.study.running import run_study
 from mampc.study.writing import study_text
+from seeds import deep
 
 SMALL = Rounds(3, 3, 4, 4, 8)
 
@@ -105,7 +106,7 @@ def test_a_seed_decides_everything_and_progress_counts_closed_loops_up_to_all_of
     assert a.rows != c.rows
 
 
-@pytest.mark.parametrize("noise", [None, 0.05])
+@pytest.mark.parametrize("noise", [None, *deep(0.05)])
 def test_units_decide_nothing(noise):
     model = tank_model()
     of_u, of_y = np.array([4.0, 0.125]), np.array([2.0, 64.0])  # powers of two: the same digits
