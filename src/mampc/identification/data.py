@@ -18,7 +18,7 @@ from mampc.plants import Plant, advance, state_sizes
 from mampc.systems.state_space import StateSpace
 
 if TYPE_CHECKING:
-    from mampc.identification.export.reading import ReadingOptions
+    from mampc.identification.export.table import ReadingOptions
 
 
 @dataclass(frozen=True, eq=False)

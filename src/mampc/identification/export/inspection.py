@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
 
 from mampc.base.checks import Array, as_number
 from mampc.identification.excitation import FEW_MOVES, missing_movement
-from mampc.identification.export.clock import Clock, read_clock
+from mampc.identification.export.clock import Clock
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.grid import make_grid, pieces
-from mampc.identification.export.header import find_column
-from mampc.identification.export.numbers import Column, read_numbers, says_numbers
-from mampc.identification.export.on_change import RARE, hint_of_changes, hold_last, sampled
-from mampc.identification.export.quality import drop_bad_quality, is_quality
-from mampc.identification.export.reading import ReadingOptions, listed, readings
-from mampc.identification.export.sheet import Sheet
+from mampc.identification.export.numbers import Column
+from mampc.identification.export.on_change import RARE
 from mampc.identification.export.suspects import note_suspects
-from mampc.identification.export.tall import open_table
+from mampc.identification.export.table import ReadingOptions, listed, origin_of, read_table
 
 HELD = 0.5  # share of samples: what keeps its value more often moves in steps
 
@@ -102,37 +97,12 @@ def inspect_export(
     Raises:
         MampcError: a file that cannot be read at all.
     """
-    findings = Findings(str(source) if isinstance(source, (str, Path)) else "DataFrame")
+    findings = Findings(origin_of(source))
     wanted = (*listed(inputs), *listed(disturbances), *listed(outputs))
-    how, reading = readings(options, wanted or None)
     if dt is not None:
         dt = as_number("dt", dt, 0.0, exclusive=True)
-    measured = listed(options.get("no_quality", ()))
-    sheet = open_table(source, wanted, how, findings, options.get("encoding"), measured)
-    taken = [at for name in wanted if (at := find_column(sheet.header, name)) is not None]
-    qualities = [at for at in range(len(sheet.header)) if at not in taken and is_quality(sheet, at, measured)]
-    clock = read_clock(sheet, [*taken, *qualities], how, findings)
-    free = [
-        at
-        for at in range(len(sheet.header))
-        if at not in (*qualities, *(clock.columns if clock else ())) and sheet.header[at]
-    ]
-    positions = dict(zip(wanted, taken, strict=True)) or _numeric(sheet, free)
-    others = tuple(sheet.header[at] for at in free if at not in positions.values()) if not wanted else ()
-    switches = [name for name in positions if name not in listed(outputs)]
-    columns, values = read_numbers(sheet, positions, reading, findings, switches)
-    drop_bad_quality(sheet, columns, positions, listed(options.get("good", ())), measured, findings)
-    for column in columns:
-        if column.marks:
-            findings.note(str(column))
-    on_change = listed(options.get("on_change", ()))
-    hint_of_changes(values, list(positions), on_change, findings)
-    if on_change:
-        hold_last(sheet, positions, on_change, clock, values, findings)
-    held = np.array([name in on_change for name in positions])
-    clock, values, numbers = sampled(clock, values, sheet.numbers, held, dt, findings)
-    for column, own in zip(columns, values.T, strict=True):
-        column.values = own
+    table = read_table(source, wanted, listed(outputs), options, dt, findings)
+    clock, values, numbers = table.clock, table.values, table.numbers
     grid = make_grid(clock, values, numbers, dt, findings)
     order, seconds = (np.arange(len(values)), np.arange(len(values)) * 1.0)
     lengths: tuple[int, ...] = (len(values),)
@@ -146,26 +116,16 @@ def inspect_export(
     elif clock is not None:
         order = np.argsort(clock.seconds, kind="stable")[: np.count_nonzero(~np.isnan(clock.seconds))]
         seconds = clock.seconds[order]
-    for column in columns:
+    values = values[order]
+    for column, own in zip(table.columns, values.T, strict=True):
         if column.name not in (*listed(inputs), *listed(disturbances)):
-            note_suspects(column.name, column.values[order], numbers[order], findings)
-    summaries = tuple(
-        _summary(column, sheet.units.get(positions[column.name], column.unit), order) for column in columns
-    )
+            note_suspects(column.name, own, numbers[order], findings)
+    summaries = tuple(map(_summary, table.columns, values.T))
     return Inspection(
-        findings.origin, summaries, others, clock.name if clock else "", seconds, grid.dt if grid else None,
+        findings.origin, summaries, table.others, clock.name if clock else "", seconds, grid.dt if grid else None,
         *_ends(clock, seconds), lengths, tuple(_missing_excitation(summaries, listed(inputs))),
         tuple(findings.notes), tuple(findings.doubts),
     )  # fmt: skip
-
-
-def _numeric(sheet: Sheet, free: Sequence[int]) -> dict[str, int]:
-    """Columns with numbers in more than half of the first rows' filled cells; of two with one name, the first."""
-    found: dict[str, int] = {}
-    for at in free:
-        if says_numbers([row[at] for row in sheet.sample]):
-            found.setdefault(sheet.header[at], at)
-    return found
 
 
 def _ends(clock: Clock | None, seconds: Array) -> tuple[str, str]:
@@ -174,8 +134,7 @@ def _ends(clock: Clock | None, seconds: Array) -> tuple[str, str]:
     return clock(float(seconds[0])), clock(float(seconds[-1]))
 
 
-def _summary(column: Column, unit: str, order: Any) -> ColumnSummary:
-    values = column.values[order]
+def _summary(column: Column, values: Array) -> ColumnSummary:
     known = values[~np.isnan(values)]
     changes = np.flatnonzero(np.diff(known))
     moves = len(changes)
@@ -192,7 +151,7 @@ def _summary(column: Column, unit: str, order: Any) -> ColumnSummary:
         verdict = "moves in steps: could be an input"
     missing = len(values) - len(known)
     return ColumnSummary(
-        column.name, unit, values, str(column) if column.marks else "", missing, moves, held, verdict
+        column.name, column.unit, values, str(column) if column.marks else "", missing, moves, held, verdict
     )
 
 
