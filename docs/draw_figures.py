@@ -145,7 +145,7 @@ def export_figures():
             reading=signals,
             settings={"feedthrough": False},
             share=2 / 3,
-        ).identified.model
+        ).model
     return {"export-columns": columns, "export-steps": model.plot()}
 
 

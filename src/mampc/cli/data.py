@@ -192,23 +192,15 @@ def identify(
         "detrend": detrend,
     }  # fmt: skip
     with progress() as show:
-        outcome = identify_and_write(
-            exports,
-            target,
-            show,
-            reading=reading,
-            settings=settings,
-            share=share,
-        )
+        outcome = identify_and_write(exports, target, show, reading=reading, settings=settings, share=share)
     console = console_for_tables()
-    identified = outcome.identified
     print_list(console, "Noticed in the export", outcome.notes)
     if len(outcome.records) > 1:
         lengths = ", ".join(map(str, outcome.records[:8])) + (", ..." if len(outcome.records) > 8 else "")
         console.print(f"Estimated on {len(outcome.records)} pieces of {lengths} samples", soft_wrap=True)
     console.print(fit_table(outcome))
-    console.print(f"Order {identified.order}", soft_wrap=True)
-    print_list(console, "Found and decided", identified.notes)
+    console.print(f"Order {outcome.order}", soft_wrap=True)
+    print_list(console, "Found and decided", outcome.found)
     for warning in outcome.warnings:
         complain(f"warning: {warning}")
     console.print(f"Wrote {target}", soft_wrap=True, markup=False)

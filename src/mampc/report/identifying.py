@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import as_number
+from mampc.base.checks import Array, as_number
 from mampc.base.errors import MampcError, counted
 from mampc.identification import Identified, IOData, Validation, n4sid
 from mampc.identification.excitation import left_open, movement_of
@@ -20,6 +20,7 @@ from mampc.report.figures import validation_figure
 from mampc.report.output import save_figure
 from mampc.systems.evidence import Evidence
 from mampc.systems.properties import properties
+from mampc.systems.state_space import StateSpace
 
 POOR_FIT = 40.0  # percent; a model below it is hardly one to control with
 SHORTEST = 10  # samples on either side of a cut
@@ -31,18 +32,26 @@ LONGEST_BAND = 200  # samples of a step response whose uncertainty is kept
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of exports.
+    """What became of exports; the records themselves are let go of.
 
     Attributes:
-        identified: the model, and its fit to the part that it was estimated on.
-        validation: on a part that it has not seen.
+        model: with what is known of it.
+        order: dead times not counted.
+        fit: to the part that the model was estimated on, percent per output.
+        held_out: the longest piece of the rest.
+        validation: on that piece.
+        found: what identification found and decided, in sentences.
         notes: what reading the exports noticed and did.
         warnings: what to look at before the model is used.
         records: numbers of samples to estimate on, one each.
     """
 
-    identified: Identified
+    model: StateSpace
+    order: int
+    fit: Array
+    held_out: IOData
     validation: Validation
+    found: tuple[str, ...]
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
     records: tuple[int, ...]
@@ -70,6 +79,28 @@ def identify_and_write(
     show("reading the record")
     records, notes = read_together(exports, **reading)
     require_writable(target)
+    outcome = _identified(records, notes, show, settings, share)
+    del records  # a long one leaves room for the drawing
+    show("writing the model and its figure")
+    outcome.model.save(target)
+    warnings = list(outcome.warnings)
+    if warnings:
+        warnings.append(f"plan a better record: mampc plan-test test.csv --model {target}")
+    try:
+        save_figure(validation_figure(outcome.held_out, outcome.validation), target.with_suffix(""))
+    except MampcError as error:
+        warnings.append(f"no figure written; {error}")
+    return replace(outcome, warnings=tuple(warnings))
+
+
+def _identified(
+    records: list[IOData],
+    notes: list[str],
+    show: Callable[[str], None],
+    settings: dict[str, Any],
+    share: float,
+) -> Outcome:
+    """The model of some records, and what it leaves open."""
     estimation, rest = hold_out(long_enough(records, notes), share)
     show("identifying a model")
     try:
@@ -83,9 +114,7 @@ def identify_and_write(
     validation = identified.validate(rest)
     show("estimating how certain it is")
     evidence = evidence_of(identified, records, lambda words: show(f"estimating how certain it is{words}"))
-    identified = replace(identified, model=replace(identified.model, evidence=evidence))
-    show("writing the model and its figure")
-    identified.model.save(target)
+    model = replace(identified.model, evidence=evidence)
     warnings = []
     if identified.stabilised:
         warnings.append(
@@ -97,15 +126,11 @@ def identify_and_write(
             f"the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at the "
             "figure, and try another --order or --detrend, or a richer record"
         )
-    unsaid = left_open(identified.model, records)
-    warnings += unsaid
-    if unsaid or poor:
-        warnings.append(f"plan a better record: mampc plan-test test.csv --model {target}")
-    try:
-        save_figure(validation_figure(rest, validation), target.with_suffix(""))
-    except MampcError as error:
-        warnings.append(f"no figure written; {error}")
-    return Outcome(identified, validation, tuple(notes), tuple(warnings), tuple(map(len, estimation)))
+    warnings += left_open(model, records)
+    return Outcome(
+        model, identified.order, identified.fit, replace(rest, u=rest.u.copy(), y=rest.y.copy()), validation,
+        identified.notes, tuple(notes), tuple(warnings), tuple(map(len, estimation)),
+    )  # fmt: skip
 
 
 def long_enough(records: Sequence[IOData], notes: list[str]) -> Sequence[IOData]:
@@ -189,8 +214,8 @@ def fit_table(outcome: Outcome) -> Any:
     table.add_column("output")
     for header in ("fit, estimation part (%)", "fit, hold-out part (%)", "whiteness of residuals (p)"):
         table.add_column(header, justify="right")
-    outputs, validation = outcome.identified.model.names.outputs, outcome.validation
-    rows = zip(outputs, outcome.identified.fit, validation.fit, validation.whiteness, strict=True)
+    outputs, validation = outcome.model.names.outputs, outcome.validation
+    rows = zip(outputs, outcome.fit, validation.fit, validation.whiteness, strict=True)
     for name, on_own, on_rest, p in rows:
         table.add_row(escape(name), f"{on_own:.1f}", f"{on_rest:.1f}", f"{p:.3f}")
     return table
@@ -198,8 +223,6 @@ def fit_table(outcome: Outcome) -> Any:
 
 def require_writable(target: Path) -> None:
     """Raise `MampcError` unless the target is a new file or a model, in a folder that is there."""
-    from mampc.systems.state_space import StateSpace
-
     if target.suffix != ".json":
         raise MampcError(f"--out: expected a name that ends in .json, received {target}")
     if not os.path.isdir(target.parent):
