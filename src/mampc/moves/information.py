@@ -29,6 +29,7 @@ from mampc.base.checks import Array, BoolArray
 from mampc.base.errors import MampcError, MampcWarning
 from mampc.program.condensing import CondensedQP
 from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.restriction import by_count
 
 MOST_KEPT = 30_000  # patterns
 
@@ -97,7 +98,7 @@ class Information:
             later = patterns[:, (j + 1) * self._m :]
             packed = np.packbits(later, axis=1)
             _, first, place = np.unique(packed, axis=0, return_index=True, return_inverse=True)
-            rows += np.array([self._missed(j, pattern) for pattern in later[first]])[place.ravel()]
+            rows += self._missed(j, later[first])[place.ravel()]
         return rows
 
     def _part(self, j: int, later: BoolArray) -> Array:
@@ -107,7 +108,7 @@ class Information:
         if known is None:
             if len(self._parts) > MOST_KEPT:
                 self._parts.clear()
-            known = self._parts[key] = self._missed(j, later)
+            known = self._parts[key] = self._missed(j, later[None])[0]
         return known
 
     def price(self, pattern: BoolArray) -> float:
@@ -137,14 +138,14 @@ class Information:
         """With these weights of the hypotheses, shape (B,)."""
         return InformationNow(self, weights)
 
-    def _missed(self, j: int, pattern: BoolArray) -> Array:
-        U, shifted = self._later[j]
-        if pattern.all():
-            return np.zeros(self.hypotheses)
-        Q = np.linalg.qr(U[:, pattern], mode="complete")[0]
-        missed = Q[:, int(pattern.sum()) :].T @ shifted
-        each: Array = np.square(missed).sum(axis=0).reshape(self.hypotheses, -1).sum(axis=1)
-        return each
+    def _missed(self, j: int, later: BoolArray) -> Array:
+        """What patterns of the moves from sample j + 1 on, shape (K, n_later), miss of it: shape (K, B)."""
+        (U, shifted), missed = self._later[j], np.zeros((len(later), self.hypotheses))
+        for which, moves in by_count(later):
+            Q = np.linalg.qr(U[:, moves].transpose(1, 0, 2), mode="complete")[0]
+            rest = Q[:, :, moves.shape[1] :].transpose(0, 2, 1) @ shifted
+            missed[which] = np.square(rest).sum(axis=1).reshape(len(which), self.hypotheses, -1).sum(axis=2)
+        return missed
 
 
 class InformationNow(NamedTuple):
