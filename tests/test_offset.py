@@ -9,6 +9,7 @@ from scipy import signal
 import mampc
 from builders import random_model
 from mampc.controllers import offset
+from referees import all_patterns, charge, keeps_rules
 from seeds import seeds
 
 
@@ -162,6 +163,42 @@ def test_with_one_move_to_wait_for_it_is_what_a_sample_of_data_or_a_move_is_wort
         plain = mampc.largest_offset(problem, mampc.MoveRules(price=price))
         times = max(1, 41 * min(forgone / price, 1))
         np.testing.assert_allclose(counting(problem, price, 0.1).largest_offset(), plain * np.sqrt(times))
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [{}, {"counting": "simultaneous"}, {"dwell": 2}, {"max_moves": 3, "sparsity_horizon": 2}],
+    ids=["price", "simultaneous", "dwell", "budget"],
+)
+def test_it_is_the_largest_over_all_patterns_one_by_one(rules):
+    problem = mampc.TrackingProblem(
+        random_model(5, m=2, l=2, radius=0.7), prediction_horizon=8, control_horizon=3, tail_horizon=30.0
+    )
+    rules = mampc.MoveRules(price=0.05, **rules)
+    regulator = mampc.Regulator(
+        mampc.MAMPC(problem, rules), mampc.LoadBank(problem.model, noise=0.1), value_of_information=True
+    )
+    later_data, rest = regulator._planner.information.steady, np.tile(problem.model.u_op, (9, 1))
+    cost = {
+        pattern.tobytes(): charge(rules, pattern) + later_data.charge(pattern.ravel())
+        for pattern in all_patterns(3, 2)
+        if keeps_rules(rules, rest, pattern)
+    }
+
+    def least(pattern):
+        """Of a pattern and of those that hold it."""
+        return min(cost.get(p.tobytes(), np.inf) for p in all_patterns(3, 2) if (p | ~pattern).all())
+
+    first = np.array([[True] * 2, [False] * 2, [False] * 2])
+    of_waiting = max(
+        least(first) - cost[p.tobytes()] + 30 * (least(np.roll(p, -1, axis=0)) - cost[p.tobytes()])
+        for p in all_patterns(3, 2)
+        if p.tobytes() in cost and not p[0].any()
+    )
+    alone = mampc.largest_offset(problem, rules)
+    expected = alone * np.sqrt(of_waiting / charge(rules, first))
+    np.testing.assert_allclose(regulator.largest_offset(), expected, rtol=1e-9)
+    assert (expected > alone).all()
 
 
 def test_plans_that_wait_do_leave_more_than_a_price_alone_and_nearly_all_of_the_bound():

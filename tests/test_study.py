@@ -192,6 +192,11 @@ def test_the_summary_holds_what_is_promised(result):
             assert sum(entry["status"].values()) == 20
             assert len(entry["travel_per_input"]) == 2
             assert entry["moves"] == sum(entry["moves_per_input"])
+            priced = next(
+                t.rules and t.rules.price for t in result.study.controllers if t.name == entry["name"]
+            )
+            assert entry["counts_on_later_data"] is bool(priced)
+            assert entry["largest_offset"] == [None, None]  # without a tail
 
 
 def test_the_files_of_a_run_can_be_read_back(tmp_path, monkeypatch):
