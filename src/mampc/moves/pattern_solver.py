@@ -88,6 +88,7 @@ class PatternSolver:
 
     def __init__(self, condensed: CondensedQP, admissible: AdmissiblePatterns) -> None:
         self.condensed, self.admissible = condensed, admissible
+        self._rounding = ROUNDING * condensed.move_prefix
         self._kept: OrderedDict[bytes, Restriction] = OrderedDict()
         self._kept_bytes = 0
         self._levels: LevelSearch | None = None
@@ -271,8 +272,8 @@ class PatternSolver:
             return OnPattern(None, objective, QPStatus.OPTIMAL, multipliers, 1)
         moves: Array = np.zeros(self.condensed.n_moves)
         moves[pattern] = chosen
-        small = np.abs(chosen) < ROUNDING * self.condensed.move_prefix[pattern]
-        if small.any() and (self.admissible.priced or chosen[small].any()):
+        small = np.abs(chosen) < self._rounding[pattern]
+        if np.count_nonzero(small) and (self.admissible.priced or np.count_nonzero(chosen[small])):
             moves = without_rounding(self.condensed, sample, moves)
             # With later data the pattern counts: what these will decide may be nothing as yet.
             if sample.later_data is None:

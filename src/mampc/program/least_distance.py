@@ -230,8 +230,8 @@ class LeastDistance:
         pull, v, (low, high) = multipliers / self.even, self._v, distances
         gradient = pull.dot(self._every)
         gradient += self._f
-        square = 0.25 * (gradient * gradient).sum(axis=-1)
-        kept = (pull * np.where(pull > 0, high, low)).sum(axis=-1)
+        square = 0.25 * _products(gradient, gradient)
+        kept = _products(pull, np.where(pull > 0, high, low))
         # Where moves are nearly the same, squares far above the cost cancel each other: no bound may gain by that.
         lost = gradient.shape[-1] * ROUNDING * (square + abs(kept))
         return -0.5 * gradient[..., v:], -square - kept - lost
@@ -248,3 +248,9 @@ class LeastDistance:
         if len(low) == self._v:  # no bounds but those of the violations, which begin at zero
             return 0.0
         return max(float(low[low.argmax()]), -float(high[high.argmin()]))
+
+
+def _products(a: Array, b: Array) -> Array:
+    """Scalar products of vectors along the last axis, one or many."""
+    products: Array = a.dot(b) if a.ndim == 1 else np.einsum("...i,...i->...", a, b)
+    return products
