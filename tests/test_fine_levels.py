@@ -10,6 +10,7 @@ from builders import random_model
 from mampc import Status
 from mampc.methods.exact import ranking, search
 from mampc.moves import level_search
+from mampc.moves.last_first import LastFirst
 from referees import objective_of
 from seeds import seeds
 from test_levels import instance, random_rules
@@ -56,6 +57,44 @@ def test_patterns_and_courses_have_the_same_optimum(seed, monkeypatch):
     for decision in found:
         cost = objective_of(problem, rules, x, past, reference, decision.plan)
         assert decision.objective == pytest.approx(cost, rel=1e-7)
+
+
+@pytest.mark.parametrize("seed", seeds(300, quick=40))
+def test_courses_decided_from_either_end_have_the_same_optimum(seed, monkeypatch):
+    """With inputs between levels, limits of the moment and blocks among the rules; cut short, with a bound on it."""
+    monkeypatch.setattr(search, "FINE", 0.0)
+    rng = np.random.default_rng(seed)
+    problem, rules, x, past, reference = case(seed)
+    rules = replace(rules, counting="elementwise", max_moves_per_step=None)
+    if seed % 3 == 0:
+        past = past + 0.01 * rng.standard_normal(past.shape)
+    limits = (
+        replace(problem.limits, u_max=problem.limits.u_max - rng.uniform(0, 1)) if seed % 5 == 0 else None
+    )
+    found, run = [], LastFirst.run
+    for most in (None, 0, 3, 100, np.inf):
+
+        def searched(self, deadline, _, keeps, most=most):
+            return None if most is None else run(self, deadline, most, keeps)
+
+        monkeypatch.setattr(LastFirst, "run", searched)
+        controller = mampc.MAMPC(problem, rules, method=mampc.Exact(time_limit=None))
+        found.append(controller.step(controller.initial_state(past), x, reference, limits=limits))
+    forward, *short, complete = found
+    assert complete.status is forward.status
+    assert complete.objective == pytest.approx(forward.objective, rel=1e-9)
+    for decision in short:
+        assert decision.lower_bound <= forward.objective * (1 + 1e-9)
+        assert decision.objective >= forward.objective * (1 - 1e-9)
+
+
+def test_coarse_levels_of_three_inputs_with_a_price_are_proven_in_few_nodes(monkeypatch):
+    visited, run = [], LastFirst.run
+    monkeypatch.setattr(LastFirst, "run", lambda *of: visited.append(run(*of)) or visited[-1])
+    controller, x, reference = three_inputs(0.5)
+    decision = controller.step(controller.initial_state(), x, 0.2 * np.array(reference))
+    assert decision.status is Status.OPTIMAL
+    assert visited[0].visited < 5_000
 
 
 def three_inputs(levels, size=1.0):

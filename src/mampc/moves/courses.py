@@ -42,6 +42,16 @@ def past_of(inputs: Array, levels: InputLevels, input_prefix: Array) -> Past:
     return Past(last, starts)
 
 
+class Found(NamedTuple):
+    """The best course found: its moves, shape (n_moves,), or None; no course left out costs less than `bound`."""
+
+    moves: Array | None
+    objective: float
+    bound: float
+    complete: bool
+    visited: int
+
+
 class Courses(NamedTuple):
     """Nodes: courses decided up to some move; K of them.
 
@@ -103,8 +113,22 @@ class NextMoves:
         self._low, self._high = low - kept, high + kept
         simple = slice(condensed.n_violations, condensed.bounds.n_simple)
         most = sample.upper[simple] if condensed.bounds.every_move else np.full(condensed.n_moves, np.inf)
-        self._du_max, self._min_size = most + np.tile(kept, shape[0]), admissible.min_size
+        self.du_max, self._min_size = most + np.tile(kept, shape[0]), admissible.min_size
         self._small = SMALLER * condensed.move_prefix
+
+    def within(self, a: int, first: int, end: int | None, values: Array) -> BoolArray:
+        """Which values input a may have from sample `first` to before `end`, shape (values,)."""
+        low, high = self._low[first:end, a], self._high[first:end, a]
+        return np.asarray((values >= low.max(initial=-np.inf)) & (values <= high.min(initial=np.inf)))
+
+    def same(self, a: int, values: Array, value: float) -> BoolArray:
+        """Which values of input a are one value but for rounding, shape (values,)."""
+        return np.asarray(np.abs(values - value) <= self._small[a])
+
+    def allows(self, move: int, size: Array) -> BoolArray:
+        """Whether a move may be of these sizes."""
+        least = self._min_size[move] - self._small[move]
+        return np.asarray((size > self._small[move]) & (size <= self.du_max[move]) & (size >= least))
 
     def staying(self, j: int, a: int, nodes: Courses) -> Indices:
         """The nodes that may leave input a at sample j where it is."""
@@ -147,28 +171,36 @@ class NextMoves:
         """
         values, move = self._levels.values[a], j * self._m + a
         assert values is not None
-        u, count, may = nodes.u[:, a], len(nodes.bound), self._may_move(j, a, nodes)
-        least, most = (
-            np.searchsorted(values, self._low[j, a]),
-            np.searchsorted(values, self._high[j, a], side="right"),
-        )
-        first = np.clip(np.searchsorted(values, centre - room), least, most)
-        end = np.clip(np.searchsorted(values, centre + room, side="right"), first, most)
-        if nearest is not None:
-            at = np.searchsorted(values, centre)
-            first = np.minimum(np.maximum(first, np.minimum(at - nearest // 2 - 1, most - nearest)), end)
-            end = np.minimum(end, np.maximum(first, first + nearest))
-        counts = np.where(may, end - first, 0)
-        totals = np.cumsum(counts + 1)
-        waiting = (
-            count if nearest is not None else max(1, int(np.searchsorted(totals, TOGETHER, side="right")))
-        )
-        waiting = min(waiting, count)
-        counts = counts[:waiting]
-        rows = np.repeat(np.arange(waiting), counts)
-        offset = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        chosen = values[first[rows] + offset]
-        size = np.abs(chosen - u[rows])
-        kept = (size > self._small[move]) & (size <= self._du_max[move])
-        kept &= size >= self._min_size[move] - self._small[move]
+        values = values[self.within(a, j, j + 1, values)]
+        rows, index, waiting = windows(values, centre, room, nearest, self._may_move(j, a, nodes))
+        chosen = values[index]
+        kept = self.allows(move, np.abs(chosen - nodes.u[rows, a]))
         return rows[kept], chosen[kept], waiting
+
+
+def windows(
+    values: Array,
+    centre: Array,
+    room: Array,
+    nearest: int | None,
+    may: BoolArray | None = None,
+) -> tuple[Indices, Indices, int]:
+    """Nodes and indices of values, which are in order, within `room` of `centre`; the first node that has to wait.
+
+    Both of shape (K,); with `nearest` only so many values of each node, and none of those that may not, shape (K,).
+    """
+    most, count = len(values), len(centre)
+    first = np.searchsorted(values, centre - room)
+    end = np.maximum(np.searchsorted(values, centre + room, side="right"), first)
+    if nearest is not None:
+        at = np.searchsorted(values, centre)
+        first = np.minimum(np.maximum(first, np.minimum(at - nearest // 2 - 1, most - nearest)), end)
+        end = np.minimum(end, np.maximum(first, first + nearest))
+    counts = end - first if may is None else np.where(may, end - first, 0)
+    totals = np.cumsum(counts + 1)
+    waiting = count if nearest is not None else max(1, int(np.searchsorted(totals, TOGETHER, side="right")))
+    waiting = min(waiting, count)
+    counts = counts[:waiting]
+    rows = np.repeat(np.arange(waiting), counts)
+    offset = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return rows, first[rows] + offset, waiting

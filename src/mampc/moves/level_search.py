@@ -25,7 +25,8 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.base.tolerances import tie
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
-from mampc.moves.courses import Courses, NextMoves, Past, past_of
+from mampc.moves.courses import Courses, Found, NextMoves, Past, past_of
+from mampc.moves.last_first import LastFirst, ValueFactor
 from mampc.moves.level_outputs import LimitedOutputs, ZonedOutputs
 from mampc.program.condensing import CondensedQP
 from mampc.program.levels import InputLevels
@@ -39,16 +40,6 @@ CACHE_BYTES = 64e6  # for the factors of recent patterns
 
 # The best moves where those of inputs with levels are given, shape (n_moves,), and what they cost; None for none.
 Completion: TypeAlias = Callable[[Array], tuple[Array, float] | None]
-
-
-class Found(NamedTuple):
-    """The best course found: its moves, shape (n_moves,), or None; no course left out costs less than `bound`."""
-
-    moves: Array | None
-    objective: float
-    bound: float
-    complete: bool
-    visited: int
 
 
 class Factor(NamedTuple):
@@ -84,9 +75,15 @@ class LevelSearch:
         self.condensed, self.admissible, self.levels = condensed, admissible, levels
         self.on_levels = np.tile([values is not None for values in levels.values], admissible.control_horizon)
         self._factors: OrderedDict[bytes, Factor] = OrderedDict()
+        self._values: OrderedDict[bytes, ValueFactor] = OrderedDict()
         limited = len(condensed.bounds.above) + len(condensed.bounds.below) > 0
         self.outputs = LimitedOutputs(condensed) if limited else None
         self.zones = None if condensed.bounds.zones is None else ZonedOutputs(condensed)
+
+        # What is known of a course from its start alone has to be decided in the order of time.
+        self._last_first = self.zones is None and not (
+            admissible.simultaneous or admissible.per_step < admissible.n_inputs or any(levels.timings)
+        )
 
     @property
     def rounding_cost(self) -> float:
@@ -128,6 +125,17 @@ class LevelSearch:
                 self._factors.popitem(last=False)
         return kept
 
+    def _of_values(self, pattern: BoolArray) -> ValueFactor:
+        """The cost in the values after the moves of a pattern, shape (n_moves,)."""
+        key = pattern.tobytes()
+        kept = self._values.get(key)
+        if kept is None:
+            U = self.condensed.U
+            kept = self._values[key] = ValueFactor(U, np.flatnonzero(pattern), self.admissible.n_inputs)
+            if len(self._values) > CACHE_BYTES / (16 * U.size):
+                self._values.popitem(last=False)
+        return kept
+
     def search(
         self,
         sample: Sample,
@@ -155,8 +163,21 @@ class LevelSearch:
             deadline: of `perf_counter`.
             most: nodes to visit.
         """
+        if completed is None and self._last_first:
+            factor = self._of_values(pattern & self.admissible.open(allowance))
+            ends = LastFirst(self, sample, factor, allowance, past, priced, paid, cutoff)
+            found = ends.run(deadline, most, lambda moves: self._keeps_limits(sample, moves))
+            if found is not None:
+                return found
         one = _OneSample(self, sample, self.factor(pattern), allowance, past, priced, completed, paid, cutoff)
         return one.run(deadline, most)
+
+    def _keeps_limits(self, sample: Sample, moves: Array) -> bool:
+        """Whether outputs are within their limits with these moves."""
+        if self.outputs is None:
+            return True
+        room, every, none = self.outputs.room(sample), self.outputs.last >= -1, self.outputs.none(1)
+        return not (self.outputs.excess(moves[None], room, every, none) > 0).any()
 
 
 class _OneSample:

@@ -12,8 +12,8 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.base.tolerances import ROUNDING, SMALLER
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
-from mampc.moves.courses import Past
-from mampc.moves.level_search import Completion, Found, LevelSearch
+from mampc.moves.courses import Found, Past
+from mampc.moves.level_search import Completion, LevelSearch
 from mampc.moves.rounding import without_rounding
 from mampc.moves.signs import search_signs
 from mampc.program.condensing import CondensedQP
