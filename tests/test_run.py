@@ -1,6 +1,7 @@
 """What is measured of a run, and how it is written."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,17 @@ def hand_made_run():
         t=2.0 * np.arange(5), u=u, y=y, y_measured=y + 0.5, r=np.zeros((5, 1)), u_initial=np.zeros(2),
         decisions=(), dt=2.0, names=mampc.Names(("valve", "pump"), ("level",)), v=np.empty((5, 0)), faults={},
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("weight", "expected"),
+    [(None, 41.0), (2.0, 82.0), ([1.0, 0.01], 16.25), ([[1.0, 0.1], [0.1, 0.01]], 20.25)],
+)
+def test_errors_are_weighed_as_told(weight, expected):
+    run = replace(hand_made_run(), y=np.tile([4.0, 5.0], (5, 1)), r=np.zeros((5, 2)))
+    metrics = run.metrics(output_weight=weight)
+    assert metrics.weighted_error == pytest.approx(expected)
+    assert metrics.tracking_error == pytest.approx(41.0)
 
 
 def test_metrics_equal_those_worked_out_by_hand():

@@ -71,6 +71,32 @@ def test_a_run_of_a_sweep_is_the_run_of_its_study(swept):
     assert row["error"] == pytest.approx(run.metrics().tracking_error, rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("weight", "compared"),
+    [(1.0, None), ([3.0, 3.0], None), ([[2.0, 0.0], [0.0, 2.0]], None), ([1.0, 1e4], [1.0, 1e4])],
+)
+def test_outputs_that_weigh_differently_are_compared_with_their_weights(weight, compared, tmp_path):
+    from mampc.report.summary import summarise
+    from mampc.report.tables import error_label
+    from mampc.study import run_study
+
+    study = small()
+    study = study.model_copy(update={
+        "steps": 8, "controllers": study.controllers[:1],
+        "problem": study.problem.model_copy(update={"output_weight": weight}),
+    })  # fmt: skip
+    assert study.error_weight == compared
+    assert ("weighted" in error_label(False, study.error_weight)) is (compared is not None)
+    result = run_study(study)
+    (run,) = next(iter(result.runs.values())).values()
+    (entry,) = summarise(result)["scenarios"][0]["controllers"]
+    squares = ((run.y - run.r) ** 2).mean(axis=0)
+    assert entry["tracking_error"] == pytest.approx(squares.sum())
+    assert entry["weighted_error"] == pytest.approx(squares @ ([1.0, 1.0] if compared is None else compared))
+    for row in run_sweep(Sweep(study, seeds=1, points=1), tmp_path, jobs=1):
+        assert row["error"] == pytest.approx(entry["weighted_error"])
+
+
 def test_two_processes_give_the_same_rows(swept, tmp_path):
     sweep, _, rows = swept
     assert run_sweep(sweep, tmp_path, jobs=2) == rows

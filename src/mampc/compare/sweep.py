@@ -180,11 +180,12 @@ def run_task(sweep: Sweep, prepared: Prepared, task: Task) -> list[dict[str, Any
     seeds = range(first, first + sweep.seeds)
     batch = run_seeds(study, prepared, task.scenario, regulator, seeds)
     rows = []
-    for seed, metrics in zip(seeds, batch.metrics(threshold=study.threshold, skip=study.skip), strict=True):
+    figures = batch.metrics(threshold=study.threshold, skip=study.skip, output_weight=study.error_weight)
+    for seed, metrics in zip(seeds, figures, strict=True):
         rows.append({
             "scenario": task.scenario.name, "controller": task.table.name, "method": task.table.method,
             "value": task.value, "seed": seed, "moves": int(metrics.moves.sum()),
-            "error": metrics.tracking_error, "steps": metrics.steps,
+            "error": metrics.weighted_error, "steps": metrics.steps,
             "moves_per_hour": float(metrics.moves.sum() * 3600 / (metrics.steps * study.dt)),
             "reversals": int(metrics.reversals.sum()),
             **{f"moves_{i}": int(count) for i, count in enumerate(metrics.moves.tolist())},

@@ -87,10 +87,14 @@ class Batch:
             **{name: getattr(self, name) for name in shared},
         )
 
-    def metrics(self, *, threshold: float = 0.1, skip: int = 0, dead_band: Any = 0.0) -> BatchMetrics:
+    def metrics(
+        self, *, threshold: float = 0.1, skip: int = 0, dead_band: Any = 0.0, output_weight: Any = None
+    ) -> BatchMetrics:
         """`Metrics` of each loop; an attribute of all of them together, such as `.tracking_error`, is an array."""
         settings = {"threshold": threshold, "skip": skip, "dead_band": dead_band}
-        return BatchMetrics(self[s].metrics(**settings) for s in range(len(self)))
+        return BatchMetrics(
+            self[s].metrics(**settings, output_weight=output_weight) for s in range(len(self))
+        )
 
 
 def simulate_batch(

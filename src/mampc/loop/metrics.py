@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_number, as_vector, as_whole
+from mampc.base.checks import Array, as_number, as_vector, as_weight, as_whole
 from mampc.base.errors import MampcError
 from mampc.base.tolerances import SAME
 from mampc.program.zone import Zone
@@ -27,6 +27,7 @@ class Metrics:
         exact_density: share of samples at which it changes at all.
         tracking_error: mean over samples of |y - r|^2 (eq. 11), in squared output units; of outputs with a zone the
             distance to it counts, which is nothing inside.
+        weighted_error: mean of (y - r)' Q (y - r), counted likewise; `tracking_error` where no weights were told.
         time_outside: share of the samples at which an output has a zone that it is outside, shape (l,); not-a-number
             without one.
         mean_distance_outside: of an output from its zone at these samples, in output units, shape (l,); 0 where there
@@ -49,6 +50,7 @@ class Metrics:
     sparse_density: Array
     exact_density: Array
     tracking_error: float
+    weighted_error: float
     time_outside: Array
     mean_distance_outside: Array
     moves: Counts
@@ -75,6 +77,7 @@ def compute(
     position: Array | None = None,
     resolution: Any = SAME,
     zone: Zone | None = None,
+    output_weight: Any = None,
 ) -> Metrics:
     """Metrics of a trajectory.
 
@@ -87,8 +90,8 @@ def compute(
         dead_band: changes that an actuator does not answer, in input units, one number or one per input.
         position: where the actuators were, shape (T, m), whose starts are counted; default the decided inputs.
         resolution: changes up to here are rounding and no moves, in input units, as in `Decision`; default 1e-9.
-
         zone: within which outputs cost nothing, ends of shape (T, l); default none, as where they are the reference.
+        output_weight: Q of the weighted error, a scalar, one value per output, or (l, l); default 1.
 
     Source: paper, eqs. 10 and 11.
 
@@ -103,7 +106,9 @@ def compute(
     changes = np.diff(np.vstack([u_initial, u]), axis=0)[skip:]
     size = np.abs(changes)
     low, high = (r, r) if zone is None else (zone.low, zone.high)
-    off = np.maximum(np.maximum(low - y, y - high), 0.0)[skip:]
+    error = (np.maximum(y - high, 0.0) - np.maximum(low - y, 0.0))[skip:]
+    off = np.abs(error)
+    Q = 1.0 if output_weight is None else as_weight("output_weight", output_weight, y.shape[1])
     in_zone = (high > low)[skip:]
     outside, has_zone = (off > 0) & in_zone, in_zone.any(axis=0)
     times = outside.sum(axis=0)
@@ -120,7 +125,10 @@ def compute(
         threshold=threshold,
         sparse_density=(size > threshold).sum(axis=0) / steps,
         exact_density=moves / steps,
-        tracking_error=float(np.mean(np.sum(off**2, axis=1))),
+        tracking_error=(tracking_error := float(np.mean(np.sum(off**2, axis=1)))),
+        weighted_error=tracking_error
+        if output_weight is None
+        else float(np.mean(np.sum(error @ Q * error, axis=1))),
         time_outside=np.where(has_zone, times / np.maximum(in_zone.sum(axis=0), 1), np.nan),
         mean_distance_outside=np.where(has_zone, mean_distance, np.nan),
         moves=moves,

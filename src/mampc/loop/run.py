@@ -84,12 +84,14 @@ class Run:
             f"decisions: {statuses or 'not kept'})"
         )
 
-    def metrics(self, *, threshold: float = 0.1, skip: int = 0, dead_band: Any = 0.0) -> Metrics:
+    def metrics(
+        self, *, threshold: float = 0.1, skip: int = 0, dead_band: Any = 0.0, output_weight: Any = None
+    ) -> Metrics:
         """How often the inputs move and how well the outputs follow; see `Metrics`."""
         return metrics.compute(
             self.u, self.y, self.r, self.u_initial, self.dt,
             threshold=threshold, skip=skip, dead_band=dead_band, position=self.position,
-            resolution=self.resolution, zone=self.zone,
+            resolution=self.resolution, zone=self.zone, output_weight=output_weight,
         )  # fmt: skip
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from mampc.identification import IOData, Validation
 from mampc.loop.drawing import Look, looks, signals_figure
 from mampc.loop.run import Run
 from mampc.report.labels import label_points
-from mampc.report.tables import baseline
+from mampc.report.tables import baseline, error_label
 from mampc.study import StudyResult
 from mampc.study.values import file_word
 
@@ -67,7 +67,7 @@ def study_figures(result: StudyResult) -> Iterator[Drawing]:
         yield Drawing(
             f"{word}_moves-against-error",
             f"How often inputs move against how well outputs follow, {where}; best is down to the left.",
-            moves_against_error(runs, result.study.threshold, look),
+            moves_against_error(runs, result.study.threshold, look, result.study.error_weight),
         )
 
 
@@ -79,10 +79,13 @@ def result_looks(result: StudyResult) -> dict[str, Look]:
     base = baseline(result.study).name
     merit = dict.fromkeys(next(iter(result.runs.values())), 0.0)
     for runs in result.runs.values():
-        metrics = {name: run.metrics(threshold=result.study.threshold) for name, run in runs.items()}
+        metrics = {
+            name: run.metrics(threshold=result.study.threshold, output_weight=result.study.error_weight)
+            for name, run in runs.items()
+        }
         for figures in (
             {name: float(m.sparse_density.sum()) for name, m in metrics.items()},
-            {name: m.tracking_error for name, m in metrics.items()},
+            {name: m.weighted_error for name, m in metrics.items()},
         ):
             unit = figures[base] or max(figures.values()) or 1.0
             for name in merit:
@@ -92,7 +95,10 @@ def result_looks(result: StudyResult) -> dict[str, Look]:
 
 
 def moves_against_error(
-    runs: Mapping[str, Run], threshold: float, look: Mapping[str, Look] | None = None
+    runs: Mapping[str, Run],
+    threshold: float,
+    look: Mapping[str, Look] | None = None,
+    output_weight: Any = None,
 ) -> Figure:
     """Each controller as a point: how often its inputs move, and how well its outputs follow.
 
@@ -102,19 +108,20 @@ def moves_against_error(
         runs: controller -> run.
         threshold: changes above it count, in input units.
         look: controller -> how it is drawn; default by their order.
+        output_weight: Q of the errors, where outputs weigh differently.
     """
     look = looks(list(runs), list(runs)[:3]) if look is None else look
     with styled():
         figure, [[panel]] = new_figure(height=2.8)
         points, markers = [], []
         for controller, run in runs.items():
-            metrics = run.metrics(threshold=threshold)
-            points.append((100 * float(np.mean(metrics.sparse_density)), metrics.tracking_error))
+            metrics = run.metrics(threshold=threshold, output_weight=output_weight)
+            points.append((100 * float(np.mean(metrics.sparse_density)), metrics.weighted_error))
             style = look[controller]
             markers += panel.plot(*points[-1], "o", color=style.colour, markersize=7, zorder=style.order)
         panel.set_xlabel(f"samples with a move above {threshold:g}, mean of all inputs (%)")
         zones = any(run.zone is not None for run in runs.values())
-        panel.set_ylabel("squared distance outside, mean" if zones else "tracking error, mean |y − r|²")
+        panel.set_ylabel(error_label(zones, output_weight))
         right, top = np.max(points, axis=0)
         panel.set_xlim(0, 1.2 * right or 1.0)
         panel.set_ylim(0, 1.2 * top or 1.0)

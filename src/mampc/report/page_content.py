@@ -14,7 +14,7 @@ from mampc.loop.drawing import near_limits
 from mampc.loop.metrics import Metrics
 from mampc.loop.run import Run
 from mampc.report.figures import result_looks
-from mampc.report.tables import baseline, has_zones
+from mampc.report.tables import baseline, error_label, has_zones
 from mampc.study import StudyResult
 from mampc.study.schema import Study
 
@@ -61,7 +61,7 @@ def page_content(result: StudyResult, means: Means | None) -> tuple[dict[str, An
         "x": f"moves a day above {study.threshold:g}" if means is None else "moves a day",
         "log": means is not None
         and all(x > 0 for points in means.points.values() for x, _ in points.values()),
-        "y": f"{'squared distance outside, mean' if has_zones(study) else 'tracking error, mean |y − r|²'}",
+        "y": error_label(has_zones(study), study.error_weight),
         "unit": unit,
         "scenarios": scenarios,
     }
@@ -77,9 +77,12 @@ def _scenario(
     step: int,
     means: Means | None,
 ) -> dict[str, Any]:
-    metrics = {controller: run.metrics(threshold=study.threshold) for controller, run in runs.items()}
+    metrics = {
+        controller: run.metrics(threshold=study.threshold, output_weight=study.error_weight)
+        for controller, run in runs.items()
+    }
     points: Mapping[str, tuple[float, float]] = {
-        c: (float(_a_day(m, study.dt).sum()), m.tracking_error) for c, m in metrics.items()
+        c: (float(_a_day(m, study.dt).sum()), m.weighted_error) for c, m in metrics.items()
     }
     if means is not None:
         points = means.points[name]

@@ -53,8 +53,8 @@ def _controller(run: Run, study: Study, ratings: Ratings) -> dict[str, Any]:
     microseconds = run.solve_times * 1e6
     return {
         "estimator": "load_bank" if run.decisions and run.decisions[0].load is not None else "kalman_filter",
-        **_metrics(run, study.threshold, 0, ratings),
-        "without_transient": {"skipped": study.skip, **_metrics(run, study.threshold, study.skip, ratings)},
+        **_metrics(run, study, 0, ratings),
+        "without_transient": {"skipped": study.skip, **_metrics(run, study, study.skip, ratings)},
         "solve_time_us": {
             "median": float(np.median(microseconds)),
             "p99": float(np.percentile(microseconds, 99)),
@@ -81,8 +81,10 @@ def _gap(gaps: Array) -> dict[str, float | None]:
     }
 
 
-def _metrics(run: Run, threshold: float, skip: int, ratings: Ratings) -> dict[str, Any]:
-    metrics = run.metrics(threshold=threshold, skip=skip, dead_band=ratings.dead_band)
+def _metrics(run: Run, study: Study, skip: int, ratings: Ratings) -> dict[str, Any]:
+    metrics = run.metrics(
+        threshold=study.threshold, skip=skip, dead_band=ratings.dead_band, output_weight=study.error_weight
+    )
     return {
         "sparse_density": {
             "threshold": metrics.threshold,
@@ -90,6 +92,7 @@ def _metrics(run: Run, threshold: float, skip: int, ratings: Ratings) -> dict[st
             "exact_per_input": metrics.exact_density.tolist(),
         },
         "tracking_error": metrics.tracking_error,
+        "weighted_error": metrics.weighted_error,
         "time_outside_per_output": _known(metrics.time_outside),
         "mean_distance_outside_per_output": _known(metrics.mean_distance_outside),
         "travel_per_input": metrics.travel.tolist(),

@@ -31,6 +31,15 @@ def has_zones(study: Study) -> bool:
     return bool(study.reference.zones) or any(np.any(width) for width in widths)
 
 
+def error_label(zones: bool, output_weight: Any) -> str:
+    """What errors are, with a weight where outputs weigh differently."""
+    if output_weight is not None:
+        return (
+            "weighted squared distance outside, mean" if zones else "weighted tracking error, mean |y − r|²"
+        )
+    return "squared distance outside, mean" if zones else "tracking error, mean |y − r|²"
+
+
 def _outside(entry: dict[str, Any], key: str, form: str) -> str:
     """One value an output, a dash for set points."""
     return " ".join("-" if value is None else f"{value:{form}}" for value in entry[f"{key}_per_output"])
@@ -48,7 +57,7 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
         title=escape(f"{study.name}, {scenario['name']} — {samples}"),
         title_justify="left",
         title_style="bold",
-        caption=_estimators(scenario),
+        caption=_caption(study, scenario),
         caption_justify="left",
     )
     published = any(_published(controller, part) for controller in study.controllers)
@@ -80,13 +89,21 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
             *(_outside(entry, key, form) for key, form in OUTSIDE if zones),
             _ratios(
                 density["per_input"], reference["sparse_density"]["per_input"],
-                entry["tracking_error"], reference["tracking_error"],
+                entry["weighted_error"], reference["weighted_error"],
             ),
         ]  # fmt: skip
         if published:
             row += _published_cells(_published(controller, part), _published(base, part))
         table.add_row(*row, f"{times[controller.name]:.0f}")
     return table
+
+
+def _caption(study: Study, scenario: dict[str, Any]) -> str | None:
+    """What the ratios of errors weigh, where outputs weigh differently, and who estimates how."""
+    weighed = (
+        None if study.error_weight is None else "Errors are compared with the output_weight of the problem."
+    )
+    return " ".join(filter(None, (weighed, _estimators(scenario)))) or None
 
 
 def _estimators(scenario: dict[str, Any]) -> str | None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, InstanceOf, model_validator
 
 from mampc.base.errors import said_at
@@ -313,6 +314,14 @@ class Study(Table):
     controllers: Annotated[list[ControllerTable], Field(min_length=1)]
 
     place: InstanceOf[Place] = Place()
+
+    @property
+    def error_weight(self) -> Any:
+        """Q, where the outputs weigh differently, so that errors are compared with it; None where all weigh alike."""
+        weight = np.asarray(self.problem.output_weight, dtype=np.float64)
+        matrix = np.diag(weight) if weight.ndim == 1 else weight
+        alike = weight.ndim == 0 or np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
+        return None if alike else self.problem.output_weight
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:
