@@ -1,6 +1,7 @@
 """Inputs about a steady target, and what self-triggered control holds, whatever the units of states."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -74,10 +75,18 @@ def test_the_norm_of_self_triggered_control_falls_by_its_rate_under_the_lq_law_w
         assert (np.abs(law.P @ z).max(axis=0) <= law.rho * before * (1 + 1e-6)).all()
 
 
-def test_self_triggered_control_keeps_limits_of_moves_told_at_run_time():
+@pytest.mark.parametrize(
+    "rule",
+    [
+        mampc.rivals.SelfTriggered,
+        partial(mampc.rivals.Rounded, step=1.3),
+        partial(mampc.rivals.DeadBand, size=0.4),
+    ],
+)
+def test_rules_keep_limits_of_moves_told_at_run_time(rule):
     model = tank_model()
     problem = tank_problem(model, limits=mampc.Limits(u_min=0.0, u_max=100.0, du_max=20.0))
-    controller, x = mampc.rivals.SelfTriggered(mampc.MPC(problem)), np.zeros(4)
+    controller, x = rule(mampc.MPC(problem)), np.zeros(4)
     state, u, moved = controller.initial_state(), model.u_op, 0.0
     for k in range(20):
         du_max = 0.5 if k % 2 else 3.0

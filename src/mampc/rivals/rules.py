@@ -57,11 +57,24 @@ class Rule(Controller):
         if plan.moves is None:
             return plan
         u = sample.u_previous
-        return self._only(self.chosen(u + plan.moves[: len(u)], u) - u, plan)
+        moves = self.chosen(u + plan.moves[: len(u)], u) - u
+        least, most = self.first_moves(sample)
+        return self._only(np.minimum(np.maximum(moves, least), most), plan)
 
     def is_due(self, sample: Sample, state: ControllerState) -> bool:
         """Whether the controller is asked at all at this sample."""
         return True
+
+    def first_moves(self, sample: Sample) -> tuple[Array, Array]:
+        """The least and the largest move of each input at this sample, shape (m,)."""
+        bounds, m = self.condensed.bounds, len(sample.u_previous)
+        v, rows = bounds.n_violations, bounds.input_rows
+        low, high = sample.lower[v : v + m].copy(), sample.upper[v : v + m].copy()
+        of_move = bounds.move_of_bound[rows]
+        first = of_move < m
+        low[of_move[first]] = np.maximum(low[of_move[first]], sample.lower[rows][first])
+        high[of_move[first]] = np.minimum(high[of_move[first]], sample.upper[rows][first])
+        return low, high
 
     def chosen(self, wanted: Array, u: Array) -> Array:
         """The inputs to apply, shape (m,), where the controller wants `wanted` and `u` are applied."""

@@ -79,7 +79,7 @@ class SelfTriggered(Rule):
             plan = self._only(np.zeros(m), Plan(None, Status.FEASIBLE, 0))
             return plan._replace(memory=np.concatenate([[memory[0] - 1], memory[1:]]))
         error = np.concatenate([p[self.condensed.parameter.x] - steady.x, (u - steady.u) / self._law.unit])
-        held, move = self._longest_hold(error, *self._first_moves(sample))
+        held, move = self._longest_hold(error, *self.first_moves(sample))
         if move is None or sample.frozen is not None:
             plan = self.controller.plan(sample, state)
             if plan.moves is None:
@@ -88,17 +88,6 @@ class SelfTriggered(Rule):
         else:
             plan = self._only(self._law.unit * move, Plan(None, Status.FEASIBLE, held))
         return plan._replace(memory=np.concatenate([[max(held, 1) - 1], reference]))
-
-    def _first_moves(self, sample: Sample) -> tuple[Array, Array]:
-        """The least and the largest move of each input at this sample, shape (m,)."""
-        bounds, m = self.condensed.bounds, len(sample.u_previous)
-        v, rows = bounds.n_violations, bounds.input_rows
-        low, high = sample.lower[v : v + m].copy(), sample.upper[v : v + m].copy()
-        moved = bounds.move_of_bound[rows]
-        first = moved < m
-        low[moved[first]] = np.maximum(low[moved[first]], sample.lower[rows][first])
-        high[moved[first]] = np.minimum(high[moved[first]], sample.upper[rows][first])
-        return low, high
 
     def _longest_hold(self, error: Array, least: Array, most: Array) -> tuple[int, Array | None]:
         """h, and the move (m,), in units, that keeps the decay for so long: none if holding does."""
