@@ -171,6 +171,16 @@ def test_what_the_record_said_is_in_it():
     assert "PLACEHOLDER" in own_study(MODELS["delayed"], "m.json", "own")
 
 
+def test_references_go_no_further_than_the_record_showed_outputs_to_go():
+    slow = lags(gain=[[285.0]], time_constant=14000.0, dt=5.0)
+    wide, narrow = (
+        draft(replace(slow, evidence=Evidence([[-6.0, 6.0]], [[-most, most]])), properties(slow)).changes
+        for most in (1e4, 100.0)
+    )
+    np.testing.assert_allclose(np.abs(wide), 510.0, rtol=0.02)
+    np.testing.assert_allclose(np.abs(narrow), 100.0)
+
+
 def test_names_of_any_kind_and_many_signals_make_a_study():
     names = mampc.Names(tuple(f"u\n{i}\x07" for i in range(15)), tuple(f'"y{i}' for i in range(20)))
     model = lags(gain=np.eye(20)[:, :15] * np.pi, time_constant=9.0, dt=1.0, names=names)
@@ -197,11 +207,14 @@ def test_the_command_names_the_model_from_the_study_s_folder(tmp_path, monkeypat
     MODELS["level"].save(tmp_path / "models" / "level.json")
     outcome = CliRunner().invoke(app, ["new", "level.toml", "-m", "models/level.json"])
     assert outcome.exit_code == 0, outcome.output
+    assert "run: mampc run level.toml" in outcome.output
     assert load_study("level.toml").model.file == "models/level.json"
     again = CliRunner().invoke(app, ["new", "level.toml", "-m", "models/level.json"])
     assert "does not exist yet" in str(again.exception)
     (tmp_path / "deep").mkdir()
     assert CliRunner().invoke(app, ["new", "deep/level.toml", "-m", "models/level.json"]).exit_code == 0
+    spaced = CliRunner().invoke(app, ["new", "deep/my level.toml", "-m", "models/level.json"])
+    assert "run: mampc run 'deep/my level.toml'" in spaced.output
     assert Path(load_study("deep/level.toml").model.file).is_absolute()
 
 

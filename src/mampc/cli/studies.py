@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -156,7 +157,7 @@ def new(
     with written_whole(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     console_for_tables().print(
-        f"Wrote {path}; edit it, then run: mampc run {path}", soft_wrap=True, markup=False
+        f"Wrote {path}; edit it, then run: mampc run {shlex.quote(str(path))}", soft_wrap=True, markup=False
     )
 
 

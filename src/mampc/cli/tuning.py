@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -106,7 +107,9 @@ def tune(
             f"note: {STUDY_FILE} names the plant {base.plant.kind}; put it beside its module, with its model"
         )
     console.print(
-        f"Results are in {folder}; next: mampc run {folder / STUDY_FILE}", soft_wrap=True, markup=False
+        f"Results are in {folder}; next: mampc run {shlex.quote(str(folder / STUDY_FILE))}",
+        soft_wrap=True,
+        markup=False,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -85,7 +86,7 @@ def identify_and_write(
     outcome.model.save(target)
     warnings = list(outcome.warnings)
     if warnings:
-        warnings.append(f"plan a better record: mampc plan-test test.csv --model {target}")
+        warnings.append(f"plan a better record: mampc plan-test test.csv --model {shlex.quote(str(target))}")
     try:
         save_figure(validation_figure(outcome.held_out, outcome.validation), target.with_suffix(""))
     except MampcError as error:

@@ -28,6 +28,7 @@ from mampc.systems.state_space import StateSpace
 
 CHANGE_LASTS = (20, 200)  # fewest and most samples that a change of reference lasts, dead times aside
 ASKED = 0.3  # of what inputs can hold: the change of reference
+SEEN = 0.5  # of the range of an output in the record: the largest change of its reference
 GUESSED_NOISE = 0.02  # of that change, where no record told
 MOST_CHANGES = 4  # of single outputs
 USUAL = 1 / 4  # of the highest price: most often it costs next to no error
@@ -64,7 +65,7 @@ def draft(
     gain, integrates = _held_gain(model, found, min(horizon, LEVEL_TAKES + dead_samples(model)))
     if not gain.any():
         raise MampcError("expected a model whose inputs move an output, received one where none does")
-    changes = _reachable(gain, integrates, model.u_op - low, high - model.u_op)
+    changes = _seen(_reachable(gain, integrates, model.u_op - low, high - model.u_op), model)
     asked = np.abs(changes).max(axis=0)
     # Outputs that none of the changes concerns weigh as little as what inputs do to them says.
     asked = np.where(asked > 0, asked, np.maximum((np.abs(gain) @ (high - low)) * ASKED, 1e-300))
@@ -161,6 +162,19 @@ def _reachable(gain: Array, integrates: BoolArray, down: Array, up: Array) -> Ar
     resting[integrates] = 0.0
     others = _holdable(resting / np.maximum(down, up), down, up)
     return np.vstack([rounded(levels), others])[:MOST_CHANGES]
+
+
+def _seen(changes: Array, model: StateSpace) -> Array:
+    """The changes, made smaller where they go further than the record showed outputs to go.
+
+    A slow level never settles in a record: what inputs can hold there is far from anything that the plant does.
+    """
+    if model.evidence is None:
+        return changes
+    most = SEEN * np.ptp(model.evidence.outputs, axis=1)
+    asked = (changes != 0) & (most > 0)
+    shares = np.where(asked, most / np.where(asked, np.abs(changes), 1.0), 1.0).min(axis=1, initial=1.0)
+    return np.where(shares[:, None] < 1, rounded(changes * shares[:, None]), changes)
 
 
 def _holdable(gain: Array, down: Array, up: Array) -> Array:
