@@ -37,6 +37,7 @@ SYSTEMS = {
     "a mark of bytes before a row": text(rows()[:6]) + "\ufeff" + text(rows())[len(text(rows()[:6])) :],
     "Fortran": text([[time, f"{float(u):.4E}".replace("E", "D"), y] for time, u, y in rows()]),
     "zeros at the end": text(rows()) + "\0" * 500,
+    "columns between spaces, the date and the time under one name": text(rows(), "  ", ("time", "u", "y")),
     "durations of MATLAB in seconds": text([[f"{60 * k} sec", u, y] for k, (_, u, y) in enumerate(rows())]),
     "durations of MATLAB": text([[f"{k} min", u, y] for k, (_, u, y) in enumerate(rows())]),
 }  # fmt: skip
@@ -209,3 +210,21 @@ def test_a_recorder_wants_the_name_of_a_file(path):
     problem = mampc.TrackingProblem(model, prediction_horizon=5, control_horizon=2)
     with pytest.raises(MampcError, match="path: expected the name of a file, received"):
         mampc.Recorder(path, mampc.Regulator(mampc.MPC(problem)))
+
+
+def test_hidden_worksheets_are_left_out_and_told(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["written by hand"])
+    for title, names in (("old", ("time", "u", "z")), ("June", ("time", "u", "y"))):
+        sheet = book.create_sheet(title)
+        for row in (names, *([time, float(u), float(y)] for time, u, y in rows())):
+            sheet.append(row)
+    book["old"].sheet_state = "hidden"
+    book.save(tmp_path / "export.xlsx")
+    export = read_export(tmp_path / "export.xlsx", inputs="u", outputs="y")
+    assert_whole(export)
+    assert told(export, "worksheet 'June' read, one of 2")
+    assert told(export, "hidden worksheets left out: ['old']")
+    with pytest.raises(MampcError, match=r"expected one column 'z'.*hidden worksheets left out: \['old'\]"):
+        read_export(tmp_path / "export.xlsx", inputs="u", outputs="z")

@@ -190,6 +190,15 @@ def local(samples, zone="Europe/Berlin", start="2024-10-27 01:30:00", dt=600.0):
     return times.strftime("%d.%m.%Y %H:%M:%S").tolist()
 
 
+def test_dates_of_which_a_spreadsheet_exchanged_day_and_month_are_refused(tmp_path):
+    times = stamps(dt=6 * 3600.0, start="2024-04-11 12:00:00", form="%d/%m/%Y %H:%M")
+    times = [f"{t[3:5]}/{t[:2]}{t[5:]}" if int(t[:2]) <= 12 else t for t in times]
+    with pytest.raises(
+        MampcError, match="have the day first, and are even only if some have the month first"
+    ):
+        read(tmp_path, text(rows(times)))
+
+
 @pytest.mark.parametrize("newest_first", [False, True])
 @pytest.mark.parametrize("options", [{}, {"time_zone": "Europe/Berlin"}])
 def test_the_doubled_hour_in_autumn(tmp_path, options, newest_first):

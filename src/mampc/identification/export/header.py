@@ -19,6 +19,7 @@ NUMBER_LIKE = re.compile(
     rf"[+\-−]?[\d.,]*\d[\d.,]*((?:{SPACES}| )\d{{3}}[.,\d]*)*([eEdD][+\-]?\d+)?", re.ASCII
 )
 RULE = re.compile(r"[-=+|_─]{2,}")
+DATE = re.compile(r"\d+[-/.]\w+[-/.]\d+$")
 REMARK = re.compile(r"%|#(?!N/A|REF!|VALUE!|DIV/0!|NAME\?|NUM!|NULL!)")  # spreadsheets' errors are cells
 
 Row: TypeAlias = tuple[int, list[str]]  # its number in the file, its cells
@@ -92,8 +93,8 @@ def fitted_header(
 ) -> tuple[str, ...]:
     """The header as wide as the rows under it.
 
-    R leaves out the name above the numbers of rows; LabVIEW names a last column that no row has. Not between
-    commas or spaces, which may stand in names and numbers too.
+    R leaves out the name above the numbers of rows; LabVIEW names a last column that no row has; between spaces,
+    dates and times have one name. Not between commas, which may stand in names and numbers too.
     """
     rows = [row for _, row in under if any(map(is_number_like, row[1:]))]
     widths = {len(row) for row in rows}
@@ -104,6 +105,13 @@ def fitted_header(
     if width == len(header) + 1 and [row[0] for row in rows] == counts:
         findings.note("the first column has no name: taken as numbers of rows")
         return ("", *header)
+    if (
+        separator == " "
+        and width == len(header) + 1
+        and all(DATE.match(row[0]) and ":" in row[1] for row in rows)
+    ):
+        findings.note(f"a date and a time stand under the name {header[0]!r}")
+        return (header[0], f"{header[0]} of day", *header[1:])
     left = header[:width]
     known = all(find_column(left, name) is not None for name in names)
     if separator not in (None, " ") and len(left) < len(header) and known:

@@ -107,6 +107,41 @@ def from_stamps(
     Args:
         blocks: all cells, some rows at a time: the words of a long file are never all there.
     """
+    orders, example, in_utc = _read_orders(blocks, how, name, findings)
+    best = max(order.count for order in orders.values())
+    likely = {key: order.ticks() for key, order in orders.items() if best and order.count >= 0.99 * best}
+    trial = Findings(findings.origin)
+    found = {key: since_first(ticks, in_utc, how, sheet, trial)[0] for key, ticks in likely.items()}
+    strays = {key: unevenness(seconds) for key, seconds in found.items()}
+    choice = min(strays, key=lambda key: strays[key], default="")
+    words = f"times such as {example!r} in column {name!r}"
+    if len(likely) == 1:
+        for other in orders.keys() - likely.keys():
+            ticks = orders[other].ticks()
+            ticks = np.where(ticks == NEVER, likely[choice], ticks)
+            if unevenness(since_first(ticks, in_utc, how, sheet, trial)[0]) < strays[choice] / 2:
+                findings.doubt(
+                    f"{words} have the {choice} first, and are even only if some have the {other} first, as "
+                    "spreadsheets make them of dates of another country; export them again, with the year first"
+                )
+    elif likely:
+        one, other_one, *_ = found.values()
+        if np.array_equal(one, other_one, equal_nan=True):
+            findings.note(f"{words} may have the day or the month first; the steps are the same")
+        elif max(strays.values()) < 1.05 * strays[choice] + 0.01:
+            findings.doubt(
+                f"{words} may have the day or the month first; pass their format (--time-format '%d/%m/%Y %H:%M:%S')"
+            )
+        else:
+            findings.note(f"{words} have the {choice} first: only so are they even")
+    ticks = likely[choice] if likely else np.full(len(sheet), NEVER)
+    return since_first(ticks, in_utc, how, sheet, findings)
+
+
+def _read_orders(
+    blocks: Iterable[list[str]], how: TimeReading, name: str, findings: Findings
+) -> tuple[dict[str, _Order], str, bool]:
+    """The stamps in each order of day and month in which any can be read, the first one, and if they have offsets."""
     zone = (" %z", "%z", "")
     orders = {
         order: _Order([f"{day}{time}{end}" for day, time, end in product(days, TIMES, zone)])
@@ -127,35 +162,12 @@ def from_stamps(
         words, late = from_midnight(words)
         for order in orders.values():
             order.read(words, bool(offsets), late)
-        best = max(order.count for order in orders.values())
-        orders = {key: order for key, order in orders.items() if order.count >= 0.99 * best}
-    if with_offset < 0.9 * filled and offset:
+        orders = {key: order for key, order in orders.items() if order.count} or orders
+    if offset and with_offset < 0.9 * filled:
         findings.doubt(
             f"some times in column {name!r} have an offset from UTC such as {offset!r}, others have none"
         )
-    readings = {order: np.concatenate(found.parts) for order, found in orders.items() if found.count}
-    if len(readings) < 2:
-        ticks = next(iter(readings.values()), np.full(len(sheet), NEVER))
-        return since_first(ticks, bool(offset), how, sheet, findings)
-    found = {
-        order: since_first(ticks, bool(offset), how, sheet, Findings(findings.origin))[0]
-        for order, ticks in readings.items()
-    }
-    strays = {order: unevenness(seconds) for order, seconds in found.items()}
-    choice = min(strays, key=lambda order: strays[order])
-    one, other, *_ = found.values()
-    if np.array_equal(one, other, equal_nan=True):
-        findings.note(
-            f"times such as {example!r} may have the day or the month first; the steps are the same"
-        )
-    elif max(strays.values()) < 1.05 * strays[choice] + 0.01:
-        findings.doubt(
-            f"times such as {example!r} in column {name!r} may have the day or the month first; pass their format "
-            "(--time-format '%d/%m/%Y %H:%M:%S')"
-        )
-    else:
-        findings.note(f"times such as {example!r} have the {choice} first: only so are they even")
-    return since_first(readings[choice], bool(offset), how, sheet, findings)
+    return orders, example, bool(offset)
 
 
 class _Order:
@@ -167,6 +179,10 @@ class _Order:
         self.strange: set[str] = set()  # patterns of cells that none of the formats fits
         self.parts: list[Ticks] = []
         self.count = 0  # of stamps read
+
+    def ticks(self) -> Ticks:
+        """All that was read."""
+        return np.concatenate(self.parts)
 
     def read(self, words: list[str], utc: bool, late: Any) -> None:
         """Read some rows; those that are `late` a day later than they say."""
