@@ -15,6 +15,7 @@ from mampc.report.figures import (
     validation_figure,
 )
 from mampc.study import parse_study, run_study, template
+from seeds import deep
 
 LONG = "cascaded temperature controller of the second column with a rather long name"
 
@@ -77,7 +78,7 @@ def assert_legible(figure):
 COUNTS = [n if n in (1, 12) else pytest.param(n, marks=pytest.mark.slow) for n in range(1, 13)]
 
 
-@pytest.mark.parametrize("name", ["MPC", LONG, "W" * 80])
+@pytest.mark.parametrize("name", [LONG, "W" * 80, *deep("MPC")])
 @pytest.mark.parametrize("count", COUNTS)
 def test_all_names_are_inside_the_picture_and_apart(count, name):
     runs = named_runs(count, name)

@@ -31,7 +31,7 @@ def made_up_plant(seed):
     return mampc.StateSpace(A, B, np.hstack([np.eye(l)[:, :1], np.eye(l)]), None, DT, **names)
 
 
-@pytest.mark.parametrize("seed", seeds(30, quick=3))
+@pytest.mark.parametrize("seed", seeds(30, quick=2))
 def test_a_load_leaves_no_offset_under_mpc_and_no_more_than_a_price_may(seed):
     plant, rng = made_up_plant(seed), np.random.default_rng(100 + seed)
     m, l = plant.n_inputs, plant.n_outputs

@@ -16,7 +16,7 @@ from builders import identified_tank, same_decision, tank_problem, tank_referenc
 from mampc.cli import app
 from mampc.report.output import run_and_write, trajectories
 from mampc.study import parse_study, template
-from seeds import examples
+from seeds import deep, examples
 
 TANK = mampc.plants.QuadrupleTank()
 RULES = mampc.MoveRules(max_moves=3, sparsity_horizon=3, price=0.1)
@@ -42,7 +42,7 @@ def test_a_state_kept_as_text_leads_to_the_same_decisions_to_the_bit(method):
     regulator = tight_regulator(method)
     state, rng = regulator.initial_state(), np.random.default_rng(0)
     model = regulator.controller.problem.model
-    for k in range(examples(25, quick=10)):
+    for k in range(examples(25, quick=8)):
         y = model.y_op + rng.standard_normal(2)
         reference = model.y_op + 4.0 * (k > 5)
         text = state.to_json()
@@ -82,7 +82,7 @@ def test_a_text_that_is_no_state_of_this_regulator_is_refused(spoil, expected):
 
 
 @pytest.mark.usefixtures("either_estimator")
-@pytest.mark.parametrize("preview", [False, True])
+@pytest.mark.parametrize("preview", [False, *deep(True)])
 @pytest.mark.parametrize("method", CONTROLLERS)
 def test_a_simulated_run_replays_to_the_same_bits(method, preview):
     regulator, reference = tight_regulator(method), tank_reference(examples(60, quick=20))

@@ -1,7 +1,7 @@
 """The search tree: its least squares, its bounds, and what it finds beyond the table, against independent ones."""
 
 from dataclasses import replace
-from itertools import combinations, product, repeat
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.condensing import CondensedQP
 from referees import all_patterns, best_on_every_pattern, charge
+from seeds import seeds
 
 
 @pytest.fixture(autouse=True)
@@ -281,9 +282,8 @@ def decide(problem, rules, x, reference):
     return controller.step(controller.initial_state(), x, reference)
 
 
-@pytest.mark.parametrize(
-    ("seed", "max_moves"), [*zip(range(10), repeat(None)), *product(range(4), (1, 2, 3))]
-)
+@pytest.mark.parametrize("max_moves", [None, 1, 2, 3])
+@pytest.mark.parametrize("seed", seeds(10, quick=3))
 def test_move_limits_and_prices_branch_to_the_optimum_of_brute_force(seed, max_moves, monkeypatch):
     problem, rules, x, reference = priced_case(seed, max_moves=max_moves)
     runs = []

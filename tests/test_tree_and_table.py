@@ -65,7 +65,7 @@ def sized_case(seed):
     return problem, replace(rules, min_size=size, price=price), x, reference
 
 
-@pytest.mark.parametrize("seed", [136, 140, 320, 321, 374, 416, 435, 526, *seeds(100, quick=8)])
+@pytest.mark.parametrize("seed", [136, 140, 320, 321, 374, 416, 435, 526, *seeds(100, quick=4)])
 def test_least_sizes_are_proven_alike_by_table_and_tree(seed, monkeypatch):
     by_table = decide(*sized_case(seed))
     monkeypatch.setattr(ranking, "LARGEST_TABLE", 0)
