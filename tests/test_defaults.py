@@ -172,6 +172,41 @@ def test_with_longer_delays_missing_the_bank_does_better_than_the_filter(delay):
     assert cost[0] < 0.9 * cost[1]
 
 
+@pytest.mark.parametrize("inputs", [1, 2])
+def test_with_dead_times_a_fifth_and_a_sample_off_the_bank_does_not_swing(inputs):
+    """Cost: squared errors, and a tenth for each move; one that forgets moves before they show pays ten times more."""
+    gain, lag, dead = [[1.0]], [[6.0]], [[8.0]]
+    if inputs == 2:
+        gain, lag, dead = [[1.0, 0.6], [-0.5, 1.0]], [[6.0, 10.0], [8.0, 5.0]], [[6.0, 3.0], [2.0, 7.0]]
+    model, plant = (
+        mampc.StateSpace.from_first_order(
+            gain=off * np.array(gain), time_constant=np.array(lag) / off,
+            dead_time=np.ceil(off * np.array(dead)) + late, dt=1.0,
+        )
+        for off, late in ((1.0, 0.0), (1.2, 1.0))
+    )  # fmt: skip
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=30, control_horizon=3, move_weight=0.05,
+        limits=mampc.Limits(u_min=-5 * np.ones(inputs), u_max=5 * np.ones(inputs)),
+    )  # fmt: skip
+    controller, reference = (
+        mampc.MAMPC(problem, MoveRules(price=0.1)),
+        mampc.steps(160, np.zeros(inputs), [(5, np.ones(inputs))]),
+    )
+    cost = []
+    for estimator in (LoadBank(model, noise=0.02), KalmanFilter.offset_free(model, measurement_noise=0.02)):
+        batch = mampc.simulate_batch(
+            plant,
+            mampc.Regulator(controller, estimator),
+            reference,
+            noise=0.02,
+            seeds=range(3),
+            progress=False,
+        )
+        cost.append(np.square(batch.y - reference).sum() + 0.1 * np.count_nonzero(np.diff(batch.u, axis=1)))
+    assert cost[0] < 1.5 * cost[1]
+
+
 RESONANT, INTEGRATOR = (0.0, 1.0), (1.0, 0.0)
 
 

@@ -11,7 +11,7 @@ from builders import identified_tank, random_model, tank_problem
 from load_bank_models import MODELS, bank_of
 from mampc import LoadBank, LoadKind
 from mampc.loop.disturbances import state_sizes
-from mampc.loop.doubt import LATE, runs_away
+from mampc.loop.doubt import FADED, LATE, moves_of_late, runs_away
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
 from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.riccati import predicted_covariance, seen_covariance
@@ -126,8 +126,9 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
     model, rng = MODELS[name], np.random.default_rng(0)
     bank, d = bank_of(model), model.n_disturbances
     estimate, v = bank.initial(model.u_op), model.v_op
-    u, x, h, m = model.u_op, np.zeros(model.n_states), np.zeros(model.n_outputs), model.n_inputs
-    kept, waits = np.exp(-1 / LATE), np.abs(model.poles()).max() < 1 + 1e-6
+    u, m, moves = model.u_op, model.n_inputs, []
+    waits = np.abs(model.poles()).max() < 1 + 1e-6
+    response = waits * model.step_response(60)[1:, :, :m]
     plain_filter = mampc.KalmanFilter.offset_free(model, measurement_noise=bank.noise)
     plain = plain_filter.initial(model.u_op)
     for _ in range(25):
@@ -137,9 +138,9 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
         y = model.y_op + 0.3 * rng.standard_normal(model.n_outputs)
         drive = model.B @ np.concatenate([u - model.u_op, last_v - model.v_op])
         surplus = y - model.y_op - model.D @ np.concatenate([u - model.u_op, v - model.v_op])
-        if waits:
-            x = kept * model.A @ x + model.B[:, :m] @ (u - last_u)
-            h = kept * (h + model.C @ x + model.D[:, :m] @ (u - last_u))
+        moves.insert(0, u - last_u)
+        counted = [np.exp(-(a + 1) / LATE) * response[a] @ du for a, du in enumerate(moves)]
+        h = np.sum([part for a, part in enumerate(counted) if np.exp(-a / LATE) > FADED], axis=0)
         members, weights, usual, scale = naive(bank, estimate, drive, surplus, h)
         limit = min(estimate.scale[0], 1.0)
         predicted = bank.predict(estimate, u, last_v)
@@ -157,6 +158,29 @@ def test_weights_follow_bayes_rule_and_one_step_is_prediction_and_correction(nam
         np.testing.assert_allclose(
             estimate.x, trusted(bank, estimate, plain, h, limit)[: -m - len(h)], rtol=1e-6, atol=1e-9
         )
+
+
+def test_moves_make_a_model_doubtful_when_their_dead_times_are_over():
+    """As long as they do without; each output counts its own."""
+    dead, gain, lag = np.array([[0, 7], [12, 3]]), np.array([[1.0, -0.5], [2.0, 0.3]]), np.full((2, 2), 6.0)
+    u = np.random.default_rng(0).standard_normal((60, 2)).cumsum(axis=0)
+
+    def doubted(gain, dead_time):
+        step = moves_of_late(
+            mampc.StateSpace.from_first_order(gain=gain, time_constant=lag, dead_time=dead_time, dt=1.0)
+        )
+        late, found = np.zeros(len(step)), np.zeros((60, 2))
+        for k, now in enumerate(u):
+            late = step @ np.concatenate([late, now])
+            found[k] = late[:2]
+        return found
+
+    expected = np.zeros((60, 2))
+    for i, j in np.ndindex(2, 2):
+        pair = np.zeros((2, 2))
+        pair[i, j] = gain[i, j]
+        expected[dead[i, j] :, i] += doubted(pair, 0 * dead)[: 60 - dead[i, j], i]
+    np.testing.assert_allclose(doubted(gain, dead), expected, rtol=1e-9, atol=1e-12)
 
 
 def trusted(bank, estimate, plain, h, limit):

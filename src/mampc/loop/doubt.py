@@ -5,25 +5,38 @@ from __future__ import annotations
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.systems.pairs import NEGLIGIBLE
 from mampc.systems.state_space import StateSpace
 
-LATE = 3.0  # samples since when moves make a model doubtful, of those that count less and less
+LATE = 3.0  # samples after a dead time within which moves make a model doubtful, of those that count less and less
+FADED = 0.001  # share of what moves count for at first below which they are forgotten
 LONG = 512  # samples after which what runs away has done so, where lags are short
 SETTLED = 8.0  # time constants of the slowest lag after which many in a row have settled
 INTEGRATES = 3e-4  # distance from one of a pole that may belong to integrators in a row, up to rounding
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def moves_of_late(model: StateSpace) -> Array:
-    """From `BankEstimate.late` and the inputs u (m,) applied since to the next one, shape (n + l + m, n + l + 2m).
+    """From `BankEstimate.late` and the inputs u (m,) applied since to the next one, both of l + N m + m numbers.
 
-    A plant that runs away cannot wait: there moves cast no doubt.
+    A move du of a samples ago has done S_a du to an output, and counts in h for exp(-(a - d) / LATE) of that once the
+    dead time d of this input and output is over: what comes later than expected shows no sooner. A plant that runs away
+    cannot wait: there moves cast no doubt.
     """
     n, m, l = model.n_states, model.n_inputs, model.n_outputs
-    kept = np.exp(-1 / LATE)
-    x, h, before, u = np.split(np.eye(n + l + 2 * m), np.cumsum([n, l, m]))
-    moves = 0.0 * u if runs_away(model) else u - before
-    x = kept * model.A @ x + model.B[:, :m] @ moves
-    return np.vstack([x, kept * (h + model.C @ x + model.D[:, :m] @ moves), u])
+    faded = int(np.ceil(-LATE * np.log(FADED)))
+    done = model.step_response(n + faded + 2)[1:, :, :m]
+    answers = np.abs(done) > NEGLIGIBLE * np.abs(done[: n + 1]).max(axis=0)
+    dead = answers.argmax(axis=0)
+    if runs_away(model):
+        done[:] = dead[:] = 0
+    count = int(dead.max(initial=0)) + faded
+    since = np.arange(1, count + 1)[:, None, None] - dead
+    counts = np.where((since > 0) & (since <= faded), np.exp(-since / LATE) * done[:count], 0.0)
+    # Rows of the next one: h, N moves with the latest first, and u; columns of the last one, and u.
+    _, moves, before, u = np.split(np.eye(l + (count + 2) * m), np.cumsum([l, count * m, m]))
+    moves = np.vstack([u - before, moves[: (count - 1) * m]])
+    return np.vstack([counts.transpose(1, 0, 2).reshape(l, -1) @ moves, moves, u])
 
 
 @np.errstate(over="ignore", invalid="ignore")

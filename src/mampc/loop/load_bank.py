@@ -10,12 +10,13 @@ with the innovation e_b of filter b and its covariance S_b. These hold up to one
 tell: loads are told in units of the noise, so noise that was told wrongly changes no gain.
 
 A plant may do what inputs ask for later, or more or less of it, than its model says. By what the inputs' moves of the
-last samples did to the outputs, h, their innovations may be off: these vary by 1 / t_b = 1 + h' diag(S_b^-1) h / l
-times as much, and what is corrected falls by as much. Meanwhile plans count on the bank with the weight
-t = sum_b mu_b t_b, and for the rest on the plain filter that a regulator would have without a bank: that one follows
-slowly, and in one way whatever happens, so that a wrong model costs little more with a bank than without. The factor of
-the noise counts up to one here: errors of the model, which make it larger, are no reason for less caution. Where the
-noise was guessed it counts as the least it can be, since moves may be far above the noise and within its guess.
+last samples did to the outputs, dead times aside, h, their innovations may be off: these vary by
+1 / t_b = 1 + h' diag(S_b^-1) h / l times as much, and what is corrected falls by as much. Meanwhile plans count on the
+bank with the weight t = sum_b mu_b t_b, and for the rest on the plain filter that a regulator would have without a
+bank: that one follows slowly, and in one way whatever happens, so that a wrong model costs little more with a bank than
+without. The factor of the noise counts up to one here: errors of the model, which make it larger, are no reason for
+less caution. Where the noise was guessed it counts as the least it can be, since moves may be far above the noise and
+within its guess.
 
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
@@ -111,7 +112,7 @@ class LoadBank(Estimator):
         self._filters: dict[bytes, Filters] = {}
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
-        self._of_late, self._moved = moves_of_late(model), slice(model.n_states, model.n_states + l)
+        self._of_late, self._moved = moves_of_late(model), slice(l)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         # The members' models differ in how s goes on: all may have the same A once their mixed z are multiplied by
         # `_begins` before, and by `_goes_on` after.

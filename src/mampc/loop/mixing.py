@@ -39,8 +39,8 @@ class BankEstimate(Estimate):
         weights: how likely each hypothesis is, shape (B,), with sum 1.
         usual: how likely each one is on average of the samples without jumps, shape (B,), with sum 1.
         scale: variance of the innovations beside what the noise told leads to, and how many samples have shown it.
-        late: what the inputs' moves of the last samples did to the states (n,) and to the outputs (l,), and the inputs
-            (m,) since, shape (n + l + m,).
+        late: what the inputs' moves of the last samples did to the outputs (l,), these moves (N, m) with the latest
+            first, and the inputs (m,), one behind the other.
         plain: x, d_y and d_u of the plain filter, shape (n + l + m,).
     """
 
