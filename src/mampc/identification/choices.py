@@ -26,7 +26,8 @@ from mampc.identification.held_out import (
     errors,
     split,
 )
-from mampc.identification.parts import Part, groups
+from mampc.identification.parts import Part, groups, records_of_part
+from mampc.identification.prewhitening import prewhitened
 from mampc.identification.scaling import Scaled
 
 TRENDS = {
@@ -97,7 +98,8 @@ def chosen(
     m, l = records.u[0].shape[1], records.y[0].shape[1]
     none = np.zeros((l, m), dtype=int)
     tell("looking for dead times")
-    found = find_delays(records.u, records.y) if delays is None else delays
+    latest = 0 if settings.feedthrough and not feedback else 1
+    found = find_delays(records.u, records.y, latest) if delays is None else delays
     if delays is None and found.max() <= SHORT:
         found = none
     compared_on = records.shortened(ENOUGH)
@@ -116,8 +118,12 @@ def chosen(
             return Score(NOTHING, 0)
         return Score(errors(parts, compared_on, cuts), sum(part.integrators for part in parts))
 
+    def offered(trend: str) -> Choice:
+        own = trend == "whitened" and delays is None
+        return Choice(trend, _delays_of_each(compared_on, latest) if own else found)
+
     trends = ("constant", "linear") if detrend == "auto" else (detrend,)
-    choices = [Choice(trend, found) for trend in trends]
+    choices = [offered(trend) for trend in trends]
     scores = [scored(choice) for choice in choices]
     # Where inputs excite too little for anything else, white disturbances say nothing.
     if not any(np.isfinite(score.errors.ahead) for score in scores):
@@ -129,7 +135,7 @@ def chosen(
         if settings.order is not None and not feedback:  # white disturbances come with orders of their own
             preferred = preferred[1:]
         trends = (*trends, *preferred)
-        choices += [Choice(trend, found) for trend in preferred]
+        choices += [offered(trend) for trend in preferred]
         scores += [scored(choice) for choice in choices[len(scores) :]]
     alike = min(AS_GOOD, CHANCE / (l * (compared_on.samples - front.samples)))
     best = _best(trends, scores, preferred, alike, feedback)
@@ -140,12 +146,12 @@ def chosen(
     if best:
         said += f"; this predicts held-out data {compared(score, scores[0].errors.ahead)} constants"
     notes.append(f"{said}.")
-    if delays is None and found.any():
+    if delays is None and choice.delays.any():
         without = scored(replace(choice, delays=none)).errors.ahead
         if without < score - AS_GOOD:
             choice, score = replace(choice, delays=none), without
         else:
-            spans = ", ".join(map(str, np.unique(found[found > 0])))
+            spans = ", ".join(map(str, np.unique(choice.delays[choice.delays > 0])))
             notes.append(
                 f"Dead times of {spans} samples; they predict held-out data {compared(score, without)} none."
             )
@@ -160,6 +166,15 @@ def chosen(
         said = " and ".join(f"{compared(own, error)} {poles} ones" for poles, error in rivals.items())
         notes.append(f"{choice.poles[0].upper()}{choice.poles[1:]} poles; they predict held-out data {said}.")
     return replace(choice, notes=tuple(notes))
+
+
+def _delays_of_each(records: Scaled, first: int) -> Integers:
+    """Dead times of every output, its disturbance made white. Each is a part alone: short ones cost no states."""
+    rows = []
+    for i in range(len(records.y_spread)):
+        white = prewhitened(records_of_part(records, (i,), np.zeros(records.u[0].shape[1], dtype=int)), first)
+        rows.append(find_delays(white.u, white.y, first)[0])
+    return np.array(rows)
 
 
 def _best(

@@ -28,10 +28,13 @@ _TURNS = 3
 _CHUNK = 2048  # rows at once
 
 
-def find_delays(u: Sequence[Array], y: Sequence[Array]) -> Integers:
+def find_delays(u: Sequence[Array], y: Sequence[Array], first: int = 0) -> Integers:
     """Dead times in samples, shape (l, m), of records u (N, m) and y (N, l); zero where none shows.
 
     Beyond the one sample that every sampled plant without feedthrough takes.
+
+    Args:
+        first: lag of the latest inputs that may act, 0 or 1. Under feedback the present ones know the present outputs.
     """
     m, l = u[0].shape[1], y[0].shape[1]
     total = sum(map(len, u))
@@ -42,7 +45,7 @@ def find_delays(u: Sequence[Array], y: Sequence[Array]) -> Integers:
     moments, count = _moments(u, y, lags)
     delays = np.zeros((l, m), dtype=int)
     for i in range(l):
-        delays[i] = _delays_of_output(moments, count, m, lags, i, longest)
+        delays[i] = _delays_of_output(moments, count, m, lags, i, longest, first)
     return delays
 
 
@@ -74,19 +77,19 @@ def _moments(u: Sequence[Array], y: Sequence[Array], lags: int) -> tuple[Array, 
     return moments, count
 
 
-def _delays_of_output(M: Array, count: int, m: int, lags: int, i: int, longest: int) -> Integers:
+def _delays_of_output(M: Array, count: int, m: int, lags: int, i: int, longest: int, first: int) -> Integers:
     own = m * lags + i * (OWN + 1) + np.arange(OWN + 1)
     target, past = own[:1], own[1:]
     window = np.arange(EACH)
-    delays = np.zeros(m, dtype=int)
+    delays = np.full(m, first)
     for _ in range(_TURNS):
         before = delays.copy()
         for j in range(m):
             others = [k * lags + delays[k] + window for k in range(m) if k != j]
             fixed = np.concatenate([past, *others])
-            error = _errors(M, target, fixed, j * lags + window, longest)
+            error = _errors(M, target, fixed, j * lags + window, longest)[first:]
             worse = count * np.log(error / error.min())
-            delays[j] = int(np.argmax(worse <= CHANCE))
+            delays[j] = first + int(np.argmax(worse <= CHANCE))
         if (delays == before).all():
             break
     shorter: Integers = np.maximum(delays - SAFE, 0)
