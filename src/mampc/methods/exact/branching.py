@@ -124,7 +124,8 @@ class Branching:
         found: list[tuple[Indices, float, int]] = []
         for row in solved.relaxed.without_answer:
             found += [(state, nodes[row].bound, row) for state in self._split(states[row])]
-        gap = (self._problem.cutoff - solved.bound)[:, None]
+        none = np.full(len(nodes), -np.inf)  # where no moves keep the limits
+        gap = np.subtract(self._problem.cutoff, solved.bound, out=none, where=solved.bound < np.inf)[:, None]
         undecided = states == UNDECIDED
         made, out = undecided & (solved.out >= gap), undecided & (solved.made >= gap)
         states[made], states[out] = MADE, OUT
