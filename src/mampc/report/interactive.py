@@ -18,7 +18,7 @@ import numpy as np
 from mampc.base.errors import MampcError, listed
 from mampc.loop.run import Run
 from mampc.report.page_content import Means, duration, number, page_content
-from mampc.report.tables import baseline, has_zones
+from mampc.report.tables import baseline, error_label, has_zones
 from mampc.study import StudyResult
 from mampc.study.schema import Study
 
@@ -109,7 +109,7 @@ def _tables(result: StudyResult, content: dict[str, Any]) -> str:
     base = baseline(result.study).name
     zones = has_zones(result.study)
     header = (
-        "controller", "moves a day", "distance² outside" if zones else "tracking error", f"error / {base}",
+        "controller", "moves a day", error_label(zones, result.study.error_weight).split(",")[0], f"error / {base}",
         *(("time outside",) if zones else ()), "step, median", "proven best",
     )  # fmt: skip
     tables = []

@@ -34,10 +34,8 @@ def has_zones(study: Study) -> bool:
 def error_label(zones: bool, output_weight: Any) -> str:
     """What errors are, with a weight where outputs weigh differently."""
     if output_weight is not None:
-        return (
-            "weighted squared distance outside, mean" if zones else "weighted tracking error, mean |y − r|²"
-        )
-    return "squared distance outside, mean" if zones else "tracking error, mean |y − r|²"
+        return "weighted distance² outside, mean" if zones else "weighted tracking error, mean |y − r|²"
+    return "distance² outside, mean" if zones else "tracking error, mean |y − r|²"
 
 
 def _outside(entry: dict[str, Any], key: str, form: str) -> str:
