@@ -31,7 +31,7 @@ from mampc.program.sample import Indices, LeastSquares, Sample
 if TYPE_CHECKING:
     from mampc.moves.level_search import LevelSearch
 
-BEAM = 64  # nodes of each value that the first plan is looked for among
+BEAM = 16  # nodes of each value that the first plan is looked for among
 NEAREST = 5  # levels that it tries for each
 COURSES = 1000  # that are priced for one node
 AT_ONCE = 2**17  # courses that are priced at once
@@ -165,6 +165,7 @@ class LastFirst:
         None where moves do not keep limits of outputs, of which ends say too little: the first ones or the best ones.
         """
         root, visited = self._root(), 0
+        self._finish(root._replace(cost=root.cost + np.square(root.rest).sum(axis=2)))  # without moves
         pending = [(len(self._factor.moves) - 1, root.take(root.bound < self._cutoff))]
         self._look_ahead(pending[0][1], deadline)
         if self._best is not None and not keeps(self._best):
@@ -218,7 +219,7 @@ class LastFirst:
         factor, dwell = self._factor, self._rules.rules.dwell
         later, (j, a) = int(factor.later[p]), divmod(int(factor.moves[p]), self._m)
         pivot, values = factor.R[p, p], self._values[p]
-        others = np.delete(nodes.at != 0, a, axis=1) @ np.delete(self._price, a)
+        others = (nodes.at != 0) @ np.where(np.arange(self._m) == a, 0.0, self._price)
         room = np.sqrt(np.maximum(self._cutoff - nodes.cost[:, 0] - nodes.charge - others, 0.0)) / abs(pivot)
         rows, index, waiting = windows(values, nodes.rest[:, 0, p] / pivot, room, nearest)
         v, before, since = values[index], nodes.at[rows, a], nodes.since[rows, a]
@@ -269,13 +270,14 @@ class LastFirst:
         more, jumps = extra.min(axis=1), self._factor.jumps(p)
         paid, bound = nodes.charge + moving @ self._price, nodes.bound.copy()
         looked = np.flatnonzero(every | (bound + more >= self._cutoff))
-        sets, of = np.unique(moving[looked], axis=0, return_inverse=True)
-        for k, inputs in enumerate(sets):
-            own, rows = (
-                [jump for jump, is_in in zip(jumps, inputs, strict=True) if is_in],
-                looked[of.ravel() == k],
-            )
-            if prod(jump.shape[1] for jump in own) <= COURSES:
+        sets = moving[looked] @ 2 ** np.arange(self._m)
+        for each in np.unique(sets):
+            alike = looked[sets == each]
+            inputs = np.flatnonzero(moving[alike[0]])
+            own = [jumps[a] for a in inputs]
+            if (courses := prod(jump.shape[1] for jump in own)) > COURSES:
+                continue
+            for rows in np.array_split(alike, 1 + len(alike) * courses // AT_ONCE):
                 least = _least_squares(nodes.rest[rows, :, :p], nodes.at[rows][:, inputs], own)
                 least = (nodes.cost[rows] + np.minimum(least, more[rows, None])).max(axis=1) + paid[rows]
                 bound[rows] = np.maximum(bound[rows], least)
