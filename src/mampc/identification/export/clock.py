@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
 
 from mampc.base.checks import Array
 from mampc.base.errors import shown
+from mampc.identification.export.cells import clean, is_number, numeric_share, says_numbers
 from mampc.identification.export.date_words import plain_date
 from mampc.identification.export.daytime import (
     DAY,
@@ -25,7 +26,6 @@ from mampc.identification.export.daytime import (
 )
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import find_column
-from mampc.identification.export.numbers import clean, is_number, numeric_share, says_numbers
 from mampc.identification.export.numeric_times import from_numbers
 from mampc.identification.export.sheet import Cells, Sheet
 from mampc.identification.export.stamps import (
@@ -53,15 +53,17 @@ class Clock:
         name: of the column, or of both.
         columns: their positions.
         seconds: after `origin`, not-a-number where it cannot be read; shape (N,).
-        origin: the moment that counts as zero, a `datetime`; None where the column holds numbers.
+        origin: the moment that counts as zero; None where the column holds numbers.
         zone: behind moments as messages show them.
+        doubtful: whether they may be other times than they seem.
     """
 
     name: str
     columns: tuple[int, ...]
     seconds: Array
-    origin: Any = None
+    origin: datetime | None = None
     zone: str = ""
+    doubtful: bool = False
 
     def __call__(self, second: float) -> str:
         """A moment as messages show it."""
@@ -87,47 +89,56 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     if not columns:
         return None
     name = " and ".join(sheet.header[at] for at in columns)
-    seconds: Array
-    origin: Any
-    alone = len(columns) == 1 and how.time_format is None
-    first = [" ".join(row[at] for at in columns) for row in sheet.sample]
-    if alone and says_numbers(first):
-        seconds, origin = from_numbers(sheet, columns[0], how, findings), None
-    elif alone and how.time_zone is None and (plain := plain_stamps(sheet.chunks(columns))) is not None:
-        seconds, origin = clock_put_back(*plain, sheet, findings), plain[1]
-    elif alone and _share(first, FIELDS.fullmatch) > 0.5:
-        told = MINUTES_FIRST.search(f"{name} {sheet.units.get(columns[0], '')}") is not None
-        seconds, origin = times_of_day(_words(sheet, columns, findings), name, told, sheet, findings)
-    elif any(not isinstance(cells, list) for cells in next(sheet.chunks(columns))):
-        stamps: Any = sheet.column(columns[0])
-        seconds, origin = since_first(ticks_of(stamps), stamps.dt.tz is not None, how, sheet, findings)
-    else:
-        seconds, origin = from_stamps(_words(sheet, columns, findings), how, sheet, name, findings)
-        if origin is not None and origin.year == UNDATED.year:
-            period = DAY if re.search("%[HI]", how.time_format or "%H") else HOUR
-            seconds = on_next_days(seconds, first[0], name, sheet, findings, period)
+    doubts = len(findings.doubts)
+    seconds, origin = _seconds(sheet, columns, name, how, findings)
     doubt_half_days(seconds, name, sheet, findings)
     unreadable = np.flatnonzero(np.isnan(seconds))
-    if len(unreadable) == len(seconds):
-        findings.doubt(
-            f"expected times in column {name!r}, received {_cell(sheet, columns, 0)} in row {sheet.numbers[0]}; "
-            "pass their format (--time-format '%d/%m/%Y %H:%M'), or another column (--time)"
-        )
-        return None
     if len(unreadable):
-        examples = _cell(sheet, columns, int(unreadable[0]))
+        first = int(unreadable[0])
+        cell = shown(" ".join(str(sheet.column(at)[first]) for at in columns))
+        row = f"row {sheet.numbers[first]}"
+        if len(unreadable) == len(seconds):
+            findings.doubt(
+                f"expected times in column {name!r}, received {cell} in {row}; "
+                "pass their format (--time-format '%d/%m/%Y %H:%M'), or another column (--time)"
+            )
+            return None
         findings.change(
             f"no time can be read in {rows_text(sheet.numbers[unreadable].tolist())} "
-            f"(the first says {examples}); left out"
+            f"(the first says {cell}); left out"
         )
         if len(unreadable) > 0.1 * len(seconds):
             findings.doubt(
-                f"expected times in column {name!r}, received others such as {examples} in {len(unreadable)} of "
-                f"{len(seconds)} rows, first in row {sheet.numbers[unreadable[0]]}; pass their format (--time-format)"
+                f"expected times in column {name!r}, received others such as {cell} in {len(unreadable)} of "
+                f"{len(seconds)} rows, first in {row}; pass their format (--time-format)"
             )
+    zone = ""
     if origin is not None and origin.tzinfo is not None:
-        return Clock(name, columns, seconds, origin.replace(tzinfo=None), " UTC")
-    return Clock(name, columns, seconds, origin)
+        origin, zone = origin.replace(tzinfo=None), " UTC"
+    return Clock(name, columns, seconds, origin, zone, len(findings.doubts) > doubts)
+
+
+def _seconds(
+    sheet: Sheet, columns: Sequence[int], name: str, how: TimeReading, findings: Findings
+) -> tuple[Array, datetime | None]:
+    """Times after the first stamp, and that stamp; None where they are numbers or spans."""
+    alone = len(columns) == 1 and how.time_format is None
+    first = [" ".join(row[at] for at in columns) for row in sheet.sample]
+    if alone and says_numbers(first):
+        return from_numbers(sheet, columns[0], how, findings), None
+    if alone and how.time_zone is None and (plain := plain_stamps(sheet.chunks(columns))) is not None:
+        return clock_put_back(*plain, sheet, findings), plain[1]
+    if alone and _share(first, FIELDS.fullmatch) > 0.5:
+        told = MINUTES_FIRST.search(f"{name} {sheet.units.get(columns[0], '')}") is not None
+        return times_of_day(_words(sheet, columns, findings), name, told, sheet, findings)
+    if any(not isinstance(cells, list) for cells in next(sheet.chunks(columns))):
+        stamps: Any = sheet.column(columns[0])
+        return since_first(ticks_of(stamps), stamps.dt.tz is not None, how, sheet, findings)
+    seconds, origin = from_stamps(_words(sheet, columns, findings), how, sheet, name, findings)
+    if origin is not None and origin.year == UNDATED.year:
+        period = DAY if re.search("%[HI]", how.time_format or "%H") else HOUR
+        seconds = on_next_days(seconds, first[0], name, sheet, findings, period)
+    return seconds, origin
 
 
 def _words(sheet: Sheet, columns: Sequence[int], findings: Findings) -> Iterator[list[str]]:
@@ -145,10 +156,6 @@ def _words(sheet: Sheet, columns: Sequence[int], findings: Findings) -> Iterator
         yield words
     if held:
         findings.change(f"dates in column {sheet.header[columns[0]]!r} held in {held} rows without one")
-
-
-def _cell(sheet: Sheet, columns: Sequence[int], at: int) -> str:
-    return shown(" ".join(str(sheet.column(column)[at]) for column in columns))
 
 
 def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: Findings) -> tuple[int, ...]:

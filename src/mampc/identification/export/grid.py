@@ -59,11 +59,10 @@ def make_grid(
             )
             return None
         return Grid(dt, np.arange(len(values)), np.arange(len(values)) * dt)
-    if any("no date" in doubt for doubt in findings.doubts):
+    if clock.doubtful:
         return None
-    order = _in_order(clock, numbers, findings)
-    order = _each_once(order, clock.seconds, values, numbers, findings)
-    if any("more than once" in doubt for doubt in findings.doubts):
+    order = _each_once(_in_order(clock, numbers, findings), clock.seconds, values, numbers, findings)
+    if order is None:
         return None
     seconds = clock.seconds[order]
     if len(seconds) < 2:
@@ -207,8 +206,8 @@ def _each_once(
     values: Array,
     numbers: npt.NDArray[np.int64],
     findings: Findings,
-) -> npt.NDArray[np.int64]:
-    """One row for each time: what rows of one time agree on; where they do not, no value."""
+) -> npt.NDArray[np.int64] | None:
+    """One row for each time: what rows of one time agree on; where they do not, no value. None where many are not."""
     first = np.flatnonzero(np.diff(seconds[order], prepend=-np.inf) > 0)
     if len(first) == len(order):
         return order
@@ -233,6 +232,7 @@ def _each_once(
             f"expected a time for each sample, received {len(repeated)} of {len(first)} times more than once, first in "
             f"row {min(rows)}; export times with more digits"
         )
+        return None
     return order[first]
 
 

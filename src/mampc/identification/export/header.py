@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from typing import TypeAlias
 
 from mampc.base.errors import shown
-from mampc.identification.export.cell_words import SPACES
+from mampc.identification.export.cells import SPACES
 from mampc.identification.export.findings import Findings
 
 UNIT = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from array import array
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,34 +11,35 @@ import numpy.typing as npt
 
 from mampc.base.checks import LARGEST, Array, as_number
 from mampc.base.errors import MampcError, shown
-from mampc.identification.export.cell_words import SPACES, STATES, states, without_unit
+from mampc.identification.export.cells import (
+    APART,
+    APART_FOR_SURE,
+    DIGIT,
+    EITHER,
+    GROUPED,
+    GROUPED_FOR_SURE,
+    MARK,
+    POINT,
+    SPACE,
+    SPACED,
+    STATES,
+    SWAPPED,
+    clean,
+    has_point,
+    states,
+    ungrouped,
+    without_unit,
+)
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.sheet import Cells, Sheet
 
 PLAIN_CHARACTERS = frozenset("0123456789+-.eE \n")
-POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-FORTRAN = re.compile(r"([+-]?(?:\d+[.,]\d*|[.,]\d+))[dD]([+-]?\d+)", re.ASCII)
-INDIAN = r"\d{1,2}(,\d{2})+,\d{3}(\.\d*)?"  # 12,34,567.8
-GROUPED = re.compile(rf"[+-]?(\d{{1,3}}(,\d{{3}})+(\.\d*)?|{INDIAN})", re.ASCII)  # 1,234 or 1,234,567.8
-GROUPED_FOR_SURE = re.compile(rf"[+-]?(\d{{1,3}}((,\d{{3}})+\.\d*|(,\d{{3}}){{2,}})|{INDIAN})", re.ASCII)
-SPACE = re.compile(SPACES)  # a plain space may part two numbers
-APART = re.compile(r"[+-]?\d{1,3}( \d{3})+([.,]\d*)?", re.ASCII)
-APART_FOR_SURE = re.compile(r"[+-]?\d{1,3}(( \d{3})+[.,]\d*|( \d{3}){2,})", re.ASCII)
-SPACED = re.compile(rf"[+-]?\d{{1,3}}({SPACE.pattern}\d{{3}})+(\.\d*)?", re.ASCII)
-EITHER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # 1,234: grouped thousands, or three decimals
-MINUS = str.maketrans("−–", "--")
-DIGIT = re.compile(r"\d")
-# Words that programs write in the place of a value with digits in them; a word without digits never is a number.
-MARK = re.compile(
-    r"#|\b(bad|no ?data|no ?good|err(or)?|fail(ed|ure)?|invalid|time ?out|null|nan)\b", re.IGNORECASE
-)
 # Numbers that programs write in the place of a value: they count as marks only far from all other
 # values, or below zero where no other value is.
 MARKS = [
     *(sign * float("9" * count) for count in range(3, 13) for sign in (1, -1)),
     999.25, -999.25, 32767.0, -32768.0, 65535.0, -32767.0, 2147483647.0, -2147483648.0, 4294967295.0,
 ]  # fmt: skip
-SWAPPED = str.maketrans(",.", ".,")
 
 
 @dataclass(frozen=True)
@@ -130,13 +130,6 @@ def read_numbers(
             reader.read(start, cells, rows)
         start += len(rows)
     return [reader.finish(sheet.numbers, findings, switches) for reader in readers], values
-
-
-def clean(cell: str) -> str:
-    """A cell without spaces around it, with a plain minus sign, and E for Fortran's D."""
-    word = cell.strip().translate(MINUS)
-    found = FORTRAN.fullmatch(word)
-    return f"{found[1]}E{found[2]}" if found else word
 
 
 class _Reader:
@@ -320,11 +313,11 @@ def _decimal_mark(sheet: Sheet, columns: Sequence[int], findings: Findings) -> s
             for cell in cells if isinstance(cells, list) else ():
                 if "," not in cell and "." not in cell:
                     continue
-                word = _ungrouped(without_unit(clean(cell))[0])
+                word = ungrouped(without_unit(clean(cell))[0])
                 if EITHER.fullmatch(word):
                     either = either or word
                     continue
-                point, comma = _has_point(word), _has_point(word.translate(SWAPPED))
+                point, comma = has_point(word), has_point(word.translate(SWAPPED))
                 if point != comma:
                     return "." if point else ","
     if either is None:
@@ -339,35 +332,3 @@ def _decimal_mark(sheet: Sheet, columns: Sequence[int], findings: Findings) -> s
             f"numbers such as {either!r} may have a decimal comma or grouped thousands; pass decimal (--decimal)"
         )
     return "."
-
-
-def is_number(cell: str) -> bool:
-    """Whether a cell may be a number, with either decimal mark."""
-    return _has_point(cell) or _has_point(cell.translate(SWAPPED)) or EITHER.fullmatch(cell) is not None
-
-
-def _ungrouped(word: str) -> str:
-    """Without spaces between thousands."""
-    return word.replace(" ", "") if APART_FOR_SURE.fullmatch(word) else SPACE.sub("", word)
-
-
-def _has_point(word: str) -> bool:
-    return POINT.fullmatch(word) is not None or GROUPED_FOR_SURE.fullmatch(word) is not None
-
-
-def numeric_share(cells: Iterable[str]) -> float:
-    """The share of numbers among the cells that hold anything, with either decimal mark; 0 where there is none."""
-    filled = [_ungrouped(clean(cell)) for cell in cells if cell]
-    numbers = sum(map(is_number, filled))
-    return numbers / len(filled) if filled else 0.0
-
-
-def says_numbers(cells: Sequence[str]) -> bool:
-    """Whether most cells that hold anything are numbers, with or without one unit, or two states in words."""
-    if numeric_share(cells) > 0.5:
-        return True
-    filled = [clean(cell) for cell in cells if cell]
-    if sum(cell.casefold() in STATES for cell in filled) > len(filled) / 2:
-        return True
-    bare = [number for number, unit in map(without_unit, filled) if unit]
-    return len(bare) > len(filled) / 2 and numeric_share(bare) > 0.5

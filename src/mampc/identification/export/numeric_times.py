@@ -7,9 +7,8 @@ import re
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.identification.export.cell_words import without_unit
+from mampc.identification.export.cells import POINT, clean, without_unit
 from mampc.identification.export.findings import Findings
-from mampc.identification.export.numbers import POINT, clean
 from mampc.identification.export.sheet import Sheet
 from mampc.identification.export.stamps import SECONDS, TimeReading, unevenness
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from mampc.base.checks import BoolArray
 from mampc.base.errors import shown
+from mampc.identification.export.cells import is_number, says_numbers
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import UNIT
-from mampc.identification.export.numbers import Column, is_number, says_numbers
+from mampc.identification.export.numbers import Column
 from mampc.identification.export.sheet import Cells, Sheet
 
 WORDS = (

@@ -7,7 +7,7 @@ from array import array
 from collections.abc import Collection, Sequence
 
 from mampc.base.errors import MampcError, shown
-from mampc.identification.export.cell_words import without_unit
+from mampc.identification.export.cells import without_unit
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import REMARK, RULE, Row, is_number_like
 

@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
+from mampc.identification.export.cells import says_numbers
 from mampc.identification.export.clock import Clock, read_clock
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import find_column
-from mampc.identification.export.numbers import Column, Reading, read_numbers, says_numbers
+from mampc.identification.export.numbers import Column, Reading, read_numbers
 from mampc.identification.export.on_change import hint_of_changes, hold_last, sampled
 from mampc.identification.export.quality import drop_bad_quality, is_quality
 from mampc.identification.export.sheet import Sheet
