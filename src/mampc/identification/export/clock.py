@@ -95,7 +95,7 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     unreadable = np.flatnonzero(np.isnan(seconds))
     if len(unreadable):
         first = int(unreadable[0])
-        cell = shown(" ".join(str(sheet.column(at)[first]) for at in columns))
+        cell = shown(" ".join(sheet.words(at)[first] for at in columns))
         row = f"row {sheet.numbers[first]}"
         if len(unreadable) == len(seconds):
             findings.doubt(
@@ -169,7 +169,7 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
         return () if at is None else (at,)
     free = [at for at in range(len(sheet.header)) if at not in taken]
     shares = {
-        kind: [at for at in free if _share(_sampled(sheet, at), test) > 0.5]
+        kind: [at for at in free if _share(sheet.first(at), test) > 0.5]
         for kind, test in (
             (
                 "stamps",
@@ -186,7 +186,7 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
     numeric = [
         at
         for at in free
-        if says_numbers(_sampled(sheet, at))
+        if says_numbers(sheet.first(at))
         and (
             sheet.header[at].casefold() in EXACT
             or (NAMES.fullmatch(sheet.header[at].casefold()) and _runs_on(sheet, at, 0.8))
@@ -194,7 +194,7 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
     ]
     found = stamps or [*dates, *hours] or numeric
     found = [
-        at for at in found if len(set(_sampled(sheet, at))) > 1
+        at for at in found if len(set(sheet.first(at))) > 1
     ] or found  # others hold the export's own span
     if len(found) > 1 and _all_alike([sheet.column(at) for at in found]):
         findings.note(f"{len(found)} columns of times are the same, as {sheet.header[found[0]]!r}")
@@ -217,10 +217,6 @@ def _all_alike(columns: Sequence[Cells]) -> bool:
     return all(list(column) == list(columns[0]) for column in columns[1:])
 
 
-def _sampled(sheet: Sheet, at: int) -> list[str]:
-    return [row[at] for row in sheet.sample]
-
-
 def _share(cells: Sequence[str], test: Callable[[str], Any]) -> float:
     plain = [plain_date(clean(cell)) for cell in cells if cell]
     return sum(bool(test(cell)) for cell in plain) / len(plain) if plain else 0.0
@@ -228,7 +224,7 @@ def _share(cells: Sequence[str], test: Callable[[str], Any]) -> float:
 
 def _runs_on(sheet: Sheet, at: int, share: float, *, evenly: bool = False) -> bool:
     """Whether most numbers of a sample are larger than the one before, or smaller; evenly, and no count of rows."""
-    cells = [clean(cell).replace(",", ".") for cell in _sampled(sheet, at)]
+    cells = [clean(cell).replace(",", ".") for cell in sheet.first(at)]
     steps = np.diff([float(cell) for cell in cells if numeric_share([cell]) == 1])
     if not len(steps):
         return False

@@ -11,7 +11,7 @@ from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import header_units, require_columns
-from mampc.identification.export.sheet import Cells, Sheet
+from mampc.identification.export.sheet import Cells, Sheet, words_of
 
 
 def frame_sheet(frame: Any, names: Sequence[str], findings: Findings) -> Sheet:
@@ -39,7 +39,7 @@ def frame_sheet(frame: Any, names: Sequence[str], findings: Findings) -> Sheet:
     head = frame.iloc[:50]
     sample = [
         list(row)
-        for row in zip(*(_words(_frame_cells(head.iloc[:, at])) for at in range(len(header))), strict=True)
+        for row in zip(*(words_of(_frame_cells(head.iloc[:, at])) for at in range(len(header))), strict=True)
     ]
     return Sheet(header, header_units(header), np.arange(len(frame)), chunks, None, sample)
 
@@ -63,7 +63,3 @@ def _texts(column: Any) -> list[str]:
         "" if missing else str(cell).strip()
         for cell, missing in zip(column.tolist(), column.isna().tolist(), strict=True)
     ]
-
-
-def _words(cells: Cells) -> list[str]:
-    return cells if isinstance(cells, list) else ["" if cell != cell else str(cell) for cell in cells]

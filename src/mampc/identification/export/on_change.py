@@ -43,7 +43,7 @@ def hold_last(
     for column, (name, at) in zip(values.T, positions.items(), strict=True):
         if name not in names:
             continue
-        empty = _empty(sheet, at)[order]
+        empty = np.array([not word for word in sheet.words(at)], dtype=bool)[order]
         told = np.where(empty, -1, np.arange(len(order)))
         last = np.maximum.accumulate(told)
         held = np.where(last >= 0, column[order[np.maximum(last, 0)]], np.nan)
@@ -95,10 +95,3 @@ def sampled(
         return replace(clock, seconds=times), values[order], numbers[order]
     kept = ~np.isnan(values[:, ~held]).all(axis=1)
     return replace(clock, seconds=clock.seconds[kept]), values[kept], numbers[kept]
-
-
-def _empty(sheet: Sheet, at: int) -> BoolArray:
-    cells = sheet.column(at)
-    if isinstance(cells, np.ndarray):
-        return np.asarray(np.isnan(cells))
-    return np.array([not str(cell).strip() for cell in cells], dtype=bool)

@@ -14,7 +14,7 @@ from mampc.identification.export.cells import is_number, says_numbers
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import UNIT
 from mampc.identification.export.numbers import Column
-from mampc.identification.export.sheet import Cells, Sheet
+from mampc.identification.export.sheet import Sheet
 
 WORDS = (
     "quality", "qual", "opcquality", "status", "statuscode", "qualitycode", "validity", "confidence",
@@ -83,12 +83,12 @@ def _measures(sheet: Sheet, at: int, measured: Collection[str]) -> bool:
         sheet.header[at] == "status" and "solve_time_us" in sheet.header
     ):  # of decisions, as loops are recorded
         return True
-    return any(is_number(cell) and not CODE.fullmatch(cell) for cell in (row[at] for row in sheet.sample))
+    return any(is_number(cell) and not CODE.fullmatch(cell) for cell in sheet.first(at))
 
 
 def _spoken_later(sheet: Sheet, free: Sequence[int]) -> set[int]:
     """Those of some columns that are empty at first and hold nothing but remarks on quality."""
-    empty = [at for at in free if not any(row[at] for row in sheet.sample)]
+    empty = [at for at in free if not any(sheet.first(at))]
     words: dict[int, set[str]] = {at: set() for at in empty}
     for part in sheet.chunks(empty) if empty else ():
         for at, cells in zip(empty, part, strict=True):
@@ -100,11 +100,11 @@ def _is_remark(sheet: Sheet, at: int) -> bool:
     """Whether it is by a few cells alone that a column speaks of others: where it is empty nothing is said."""
     word = _plain(sheet.header[at])
     named = word in (*WORDS, *TRUTHS, *DENIALS) or _speaks_of_any(sheet.header, at)
-    return not named and not any(row[at] for row in sheet.sample)
+    return not named and not any(sheet.first(at))
 
 
 def _is_general(sheet: Sheet, at: int) -> bool:
-    word, cells = _plain(sheet.header[at]), [row[at].strip().casefold() for row in sheet.sample]
+    word, cells = _plain(sheet.header[at]), [cell.casefold() for cell in sheet.first(at)]
     if word in WORDS:
         return True
     if word in (*TRUTHS, *DENIALS):
@@ -114,7 +114,7 @@ def _is_general(sheet: Sheet, at: int) -> bool:
 
 
 def _holds_values(sheet: Sheet, at: int) -> bool:
-    return says_numbers([row[at] for row in sheet.sample])
+    return says_numbers(sheet.first(at))
 
 
 def _speaks_of_any(header: Sequence[str], at: int) -> bool:
@@ -151,7 +151,7 @@ def drop_bad_quality(
     by_name = {column.name: column for column in columns}
     speaking = quality_columns(sheet, positions, measured)
     for at, names in speaking.items():
-        words = _words(sheet.column(at))
+        words = [word.casefold() for word in sheet.words(at)]
         denies = DENIAL.search(sheet.header[at].casefold()) is not None
         named = [str(word).strip().casefold() for word in good]
         if _is_remark(sheet, at):
@@ -213,9 +213,3 @@ def _not_true(words: Sequence[str]) -> BoolArray | None:
 def _plain(word: str) -> str:
     """Without the marks around it and a number behind it."""
     return re.sub(r"[\W_]+|[\W_]*\d+$", "", word.casefold())
-
-
-def _words(cells: Cells) -> list[str]:
-    if isinstance(cells, list):
-        return [cell.casefold() for cell in cells]
-    return ["" if cell != cell else f"{cell:g}" for cell in cells.tolist()]

@@ -70,6 +70,20 @@ class Sheet:
             return parts[0]
         return [cell for part in parts for cell in part]
 
+    def words(self, at: int) -> list[str]:
+        """All cells of one column as words, empty ones where there is nothing."""
+        return words_of(self.column(at))
+
+    def first(self, at: int) -> list[str]:
+        """The first cells of one column as words."""
+        return [row[at] for row in self.sample]
+
+
+def words_of(cells: Cells) -> list[str]:
+    if isinstance(cells, list):
+        return cells
+    return ["" if cell != cell else str(cell).removesuffix(".0") for cell in cells.tolist()]
+
 
 def open_sheet(source: Any, names: Sequence[str], findings: Findings, encoding: str | None = None) -> Sheet:
     """The table in a file, or in a pandas DataFrame.

@@ -125,7 +125,7 @@ def _numeric(sheet: Sheet, free: Sequence[int]) -> dict[str, int]:
     """Columns with numbers in more than half of the first rows' filled cells; of two with one name, the first."""
     found: dict[str, int] = {}
     for at in free:
-        if says_numbers([row[at] for row in sheet.sample]):
+        if says_numbers(sheet.first(at)):
             found.setdefault(sheet.header[at], at)
     return found
 

@@ -15,19 +15,9 @@ from mampc.identification.export.sheet import Cells, Sheet, open_sheet
 from mampc.identification.export.stamps import TimeReading
 
 TAGS = (
-    "tag",
-    "tagname",
-    "name",
-    "varname",
-    "variable",
-    "point",
-    "pointname",
-    "signal",
-    "item",
-    "itemname",
-    "sensor",
+    "tag", "tagname", "name", "varname", "variable", "point", "pointname", "signal", "item", "itemname", "sensor",
     "field",
-)
+)  # fmt: skip
 VALUES = ("value", "val", "varvalue", "wert", "valeur", "valor", "valore", "waarde")
 UNITS = ("unit", "units", "eu", "engunits", "einheit", "unité", "unidad")
 MOST_TAGS = 2000
@@ -112,8 +102,8 @@ def _tag_column(sheet: Sheet, names: Sequence[str]) -> int | None:
         at = _named(sheet.header, TAGS)
         if at is None or _named(sheet.header, VALUES) is None:
             return None
-        return at if 1 < len(set(_texts(sheet, at))) <= MOST_TAGS else None
-    found = [at for at in range(len(sheet.header)) if set(names) <= set(_texts(sheet, at))]
+        return at if 1 < len(set(sheet.words(at))) <= MOST_TAGS else None
+    found = [at for at in range(len(sheet.header)) if set(names) <= set(sheet.words(at))]
     return found[0] if len(found) == 1 else None
 
 
@@ -121,7 +111,7 @@ def _pivoted(
     sheet: Sheet, names: Sequence[str], tags: int, value: int, times: Sequence[int], quality: Sequence[int]
 ) -> Sheet:
     """One row for each time, in the order in which times come up; a second value of a tag then has a row of its own."""
-    tag_cells, columns = _texts(sheet, tags), [_texts(sheet, at) for at in (*times, value, *quality)]
+    tag_cells, columns = sheet.words(tags), [sheet.words(at) for at in (*times, value, *quality)]
     stamps = list(zip(*columns[: len(times)], strict=True))
     wanted = list(dict.fromkeys(names)) or sorted(set(tag_cells) - {""})
     place = {tag: k for k, tag in enumerate(wanted)}
@@ -160,7 +150,7 @@ def _units(sheet: Sheet, tags: Sequence[str], wanted: Sequence[str], first: int)
     at = _named(sheet.header, UNITS)
     if at is None:
         return {}
-    known = dict(zip(tags, _texts(sheet, at), strict=True))
+    known = dict(zip(tags, sheet.words(at), strict=True))
     return {first + k: known[tag] for k, tag in enumerate(wanted) if known.get(tag)}
 
 
@@ -168,8 +158,3 @@ def _named(header: Sequence[str], words: Sequence[str]) -> int | None:
     """The position of the first of these words that stands in a header."""
     plain = ["".join(filter(str.isalpha, name.casefold())) for name in header]
     return next((plain.index(word) for word in words if word in plain), None)
-
-
-def _texts(sheet: Sheet, at: int) -> list[str]:
-    cells = sheet.column(at)
-    return cells if isinstance(cells, list) else ["" if cell != cell else str(cell) for cell in cells]
