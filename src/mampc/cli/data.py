@@ -11,70 +11,24 @@ import typer
 from mampc.base.errors import MampcError
 from mampc.cli.app import app
 from mampc.cli.console import complain, console_for_tables, print_list, progress
+from mampc.cli.reading import reads_exports
 
 Inputs = Annotated[
     str, typer.Option(help="Input columns, separated by commas; a name with a comma in quotation marks.")
 ]
 Outputs = Annotated[str, typer.Option(help="Output columns, separated by commas.")]
 Disturbances = Annotated[str, typer.Option(help="Columns of inputs that are measured and not manipulated.")]
-SampleTime = Annotated[
-    float | None, typer.Option("--dt", help="Sample time in seconds, where no column tells it.")
-]
-TimeColumn = Annotated[str | None, typer.Option("--time", help="Column of times; default found.")]
-TimeUnit = Annotated[str | None, typer.Option(help="Of times that are numbers: ms, s, min, h or d.")]
-TimeFormat = Annotated[
-    str | None, typer.Option(help="Of time stamps, as strptime has it, such as '%d/%m/%Y %H:%M'.")
-]
-TimeZone = Annotated[str | None, typer.Option(help="Of local time stamps, such as Europe/Berlin.")]
-Decimal = Annotated[str | None, typer.Option(help="Decimal mark, . or , where it is in doubt.")]
-Encoding = Annotated[
-    str | None, typer.Option(help="Of a text that is not UTF-8, such as cp932; default Windows-1252.")
-]
-Bad = Annotated[
-    list[str] | None, typer.Option(help="A further word or number in place of a missing value; repeat it.")
-]
-Good = Annotated[
-    list[str] | None, typer.Option(help="A word of quality columns for a good value; repeat it.")
-]
-NoQuality = Annotated[
-    list[str] | None,
-    typer.Option(help="A column that says nothing of others though it is called so; repeat it."),
-]
-Ranges = Annotated[
-    list[str] | None,
-    typer.Option("--range", help="Lowest and highest believable value, COLUMN=LOW:HIGH; repeat it."),
-]
-Fill = Annotated[
-    int,
-    typer.Option(
-        help="Make up as many samples in a row where they are missing: inputs held, outputs on lines."
-    ),
-]
-OnChange = Annotated[
-    list[str] | None,
-    typer.Option(help="A column that is stored only when it changes: its last value holds; repeat it."),
-]
 
 
 @app.command()
+@reads_exports
 def inspect(
     export: Annotated[Path, typer.Argument(help="CSV, Excel or Parquet file.")],
     inputs: Inputs = "",
     outputs: Outputs = "",
     disturbances: Disturbances = "",
-    dt: SampleTime = None,
-    time: TimeColumn = None,
-    time_unit: TimeUnit = None,
-    time_format: TimeFormat = None,
-    time_zone: TimeZone = None,
-    decimal: Decimal = None,
-    encoding: Encoding = None,
-    bad: Bad = None,
-    good: Good = None,
-    no_quality: NoQuality = None,
-    ranges: Ranges = None,
-    fill: Fill = 0,
-    on_change: OnChange = None,
+    *,
+    reading: dict[str, Any],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Picture; default NAME-columns.png beside the file.")
     ] = None,
@@ -94,11 +48,7 @@ def inspect(
     from mampc.report.inspecting import inspection_figure, inspection_table, inspection_words
     from mampc.report.output import save_figure
 
-    reading = _reading(
-        inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
-        time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
-        encoding=encoding, on_change=tuple(on_change or ()), no_quality=tuple(no_quality or ()),
-    )  # fmt: skip
+    reading |= _columns(inputs, outputs, disturbances)
     target = export.parent / f"{export.stem}-columns.png" if out is None else out
     with progress() as show:
         show("reading the file")
@@ -128,24 +78,14 @@ def inspect(
 
 
 @app.command()
+@reads_exports
 def identify(
     exports: Annotated[list[Path], typer.Argument(help="CSV, Excel or Parquet files of one plant.")],
     inputs: Inputs,
     outputs: Outputs,
-    dt: SampleTime = None,
     disturbances: Disturbances = "",
-    time: TimeColumn = None,
-    time_unit: TimeUnit = None,
-    time_format: TimeFormat = None,
-    time_zone: TimeZone = None,
-    decimal: Decimal = None,
-    encoding: Encoding = None,
-    bad: Bad = None,
-    good: Good = None,
-    no_quality: NoQuality = None,
-    ranges: Ranges = None,
-    fill: Fill = 0,
-    on_change: OnChange = None,
+    *,
+    reading: dict[str, Any],
     order: Annotated[int | None, typer.Option(help="Model order; default from the singular values.")] = None,
     weighting: Annotated[str, typer.Option(help="cva, n4sid or moesp.")] = "cva",
     block_rows: Annotated[
@@ -182,11 +122,7 @@ def identify(
     from mampc.report.identifying import fit_table, identify_and_write
 
     target = exports[0].parent / f"{exports[0].stem}.json" if out is None else out
-    reading = _reading(
-        inputs, outputs, disturbances, ranges, bad, good, dt=dt, fill=fill,
-        time=time, time_unit=time_unit, time_format=time_format, time_zone=time_zone, decimal=decimal,
-        encoding=encoding, on_change=tuple(on_change or ()), no_quality=tuple(no_quality or ()),
-    )  # fmt: skip
+    reading |= _columns(inputs, outputs, disturbances)
     settings = {
         "order": order, "weighting": weighting, "block_rows": block_rows, "feedthrough": feedthrough,
         "detrend": detrend,
@@ -241,21 +177,8 @@ def show(
         console.print(f"Wrote {figure.with_suffix('.png')} and .svg", soft_wrap=True, markup=False)
 
 
-def _reading(
-    inputs: str, outputs: str, disturbances: str, ranges: list[str] | None, bad: list[str] | None,
-    good: list[str] | None, **plain: Any,
-) -> dict[str, Any]:  # fmt: skip
-    """The arguments of `read_export`, out of those of the command line."""
-    columns = {"inputs": words(inputs), "outputs": words(outputs), "disturbances": words(disturbances)}
-    limits = {}
-    for text in ranges or ():
-        name, _, values = text.rpartition("=")
-        low, _, high = values.partition(":")
-        try:
-            limits[name.strip()] = (float(low), float(high))
-        except ValueError:
-            raise MampcError(f"--range: expected COLUMN=LOW:HIGH, received {text!r}") from None
-    return columns | plain | {"bad": bad or (), "good": good or (), "ranges": limits}
+def _columns(inputs: str, outputs: str, disturbances: str) -> dict[str, list[str]]:
+    return {"inputs": words(inputs), "outputs": words(outputs), "disturbances": words(disturbances)}
 
 
 def words(text: str) -> list[str]:
