@@ -18,6 +18,7 @@ from rich.progress import track
 from rich.table import Table
 
 import mampc
+from measuring import three_inputs
 
 TIMES = mampc.OnOff(min_on=3.0, min_off=2.0)
 STEPS = 200
@@ -66,11 +67,7 @@ def cases() -> Iterator[tuple[str, dict[str, Any]]]:
             mampc.KalmanFilter.offset_free(problem.model),
         )
         yield f"tank, {name}", {"plant": tank, "regulator": regulator, "reference": reference, "noise": 0.1}
-    model = mampc.StateSpace.from_first_order(
-        gain=[[2.0, -0.7, 0.3], [0.5, 1.5, -0.4], [-0.3, 0.4, 1.2]],
-        time_constant=[[120, 200, 80], [90, 150, 60], [100, 70, 180]],
-        dead_time=[[20, 0, 10], [0, 30, 0], [10, 10, 0]], dt=10.0,
-    )  # fmt: skip
+    model = three_inputs()
     problem = mampc.TrackingProblem(
         model, prediction_horizon=30, control_horizon=8, limits=mampc.Limits(u_min=-5.0, u_max=5.0)
     )

@@ -23,6 +23,15 @@ def options(text: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
+def three_inputs() -> mampc.StateSpace:
+    """A plant of three inputs and outputs that interact, with dead times."""
+    return mampc.StateSpace.from_first_order(
+        gain=[[2.0, -0.7, 0.3], [0.5, 1.5, -0.4], [-0.3, 0.4, 1.2]],
+        time_constant=[[120, 200, 80], [90, 150, 60], [100, 70, 180]],
+        dead_time=[[20, 0, 10], [0, 30, 0], [10, 10, 0]], dt=10.0,
+    )  # fmt: skip
+
+
 class Row(NamedTuple):
     """One line of the table."""
 

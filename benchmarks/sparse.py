@@ -23,6 +23,7 @@ from measuring import (
     readable,
     steps_of,
     tank_problem,
+    three_inputs,
     timed,
 )
 
@@ -220,11 +221,7 @@ def move_limits_and_a_price() -> Row:
 
 def a_price_near_a_steady_state() -> Row:
     """Closed loop of a plant with three inputs and noise, most of which is spent near steady states."""
-    model = mampc.StateSpace.from_first_order(
-        gain=[[2.0, -0.7, 0.3], [0.5, 1.5, -0.4], [-0.3, 0.4, 1.2]],
-        time_constant=[[120, 200, 80], [90, 150, 60], [100, 70, 180]],
-        dead_time=[[20, 0, 10], [0, 30, 0], [10, 10, 0]], dt=10.0,
-    )  # fmt: skip
+    model = three_inputs()
     problem = mampc.TrackingProblem(
         model, prediction_horizon=60, control_horizon=15, limits=mampc.Limits(u_min=-50, u_max=50)
     )

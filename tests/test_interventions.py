@@ -8,6 +8,7 @@ import mampc
 from builders import random_model
 from mampc.cli import app
 from mampc.study import parse_study, run_study
+from studies import study_of_a_model
 
 STEPS = 24
 
@@ -108,19 +109,8 @@ def test_what_does_not_fit_is_refused_before_the_loop_begins(wrong, said):
         run_of(**wrong)
 
 
-STUDY = """
-name = "interventions"
-steps = 20
-dt = 1.0
-plant = { kind = "model" }
-model = { file = "model.json" }
-[problem]
-prediction_horizon = 8
-control_horizon = 3
-limits = { u_min = -5.0, u_max = 5.0 }
-[reference]
-initial = [0.0, 0.0]
-changes = [{ at = 2, value = [1.0, 1.0] }]
+STUDY = study_of_a_model(
+    """
 [[scenarios]]
 name = "a shift"
 noise = 0.05
@@ -130,7 +120,9 @@ manual = [{ at = 6, until = 9, input = "u1", value = 0.25 }]
 name = "price"
 method = "exact"
 rules = { price = 0.05 }
-"""
+""",
+    steps=20,
+)
 
 
 def test_a_study_says_what_operators_do_and_its_trajectory_replays(tmp_path):

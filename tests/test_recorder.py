@@ -10,6 +10,7 @@ import mampc
 from builders import random_model
 from mampc.cli import app
 from seeds import seeds
+from studies import study_of_a_model
 from test_live import random_limits
 
 HORIZON, CONTROL = 8, 3
@@ -174,18 +175,8 @@ def test_cells_that_no_recorder_writes_are_refused(tmp_path, cell, value):
         mampc.Recording.from_csv(tmp_path / "loop.csv", model.names)
 
 
-STUDY = """
-name = "live"
-steps = 8
-dt = 1.0
-plant = { kind = "model" }
-model = { file = "model.json" }
-[problem]
-prediction_horizon = 8
-control_horizon = 3
-limits = { u_min = -5.0, u_max = 5.0 }
-[reference]
-initial = [0.0, 0.0]
+STUDY = study_of_a_model(
+    """
 [[scenarios]]
 name = "one"
 [[controllers]]
@@ -195,7 +186,9 @@ method = "mpc"
 name = "sparse"
 method = "exact"
 rules = { price = 0.05 }
-"""
+""",
+    steps=8,
+)
 
 
 def test_a_live_loop_replays_from_the_command_line(tmp_path):
