@@ -22,8 +22,7 @@ PROBLEM = tank_problem(MODEL, tail_horizon=10.0, move_weight=0.03)
 def loop(valves, jump=0.0, *, price=0.1, problem=PROBLEM, method="exact"):
     settings = {"polish": True, "warm_up": 0} if method == "alternating" else {}
     rules = mampc.MoveRules(price=price, min_size=1.05 * np.asarray(jump))
-    controller = mampc.MAMPC(problem, rules, method=method, **settings)
-    return mampc.Regulator(controller, valves=valves, value_of_information=False)  # as with least sizes
+    return mampc.Regulator(mampc.MAMPC(problem, rules, method=method, **settings), valves=valves)
 
 
 def run_of(regulator, valves, *, noise=0.0, steps=200, seed=0):

@@ -70,8 +70,10 @@ def test_plans_count_on_later_data_where_few_moves_have_a_price():
     assert counts(mampc.ControllerBank({"a": mampc.MAMPC(problem, PRICE), "b": mampc.MAMPC(problem, PRICE)}))
     assert not counts(mampc.MAMPC(problem, PRICE), value_of_information=False)
     assert not counts(mampc.MAMPC(problem, PRICE), estimator=KalmanFilter.offset_free(model))
-    for rules in (MoveRules(max_moves=2, sparsity_horizon=3), MoveRules(price=1.0, min_size=1.0)):
-        assert not counts(mampc.MAMPC(problem, rules))
+    sized = MoveRules(price=1.0, min_size=1.0)
+    assert counts(mampc.MAMPC(problem, sized))
+    assert not counts(mampc.MAMPC(replace(problem, control_horizon=7), sized))
+    assert not counts(mampc.MAMPC(problem, MoveRules(max_moves=2, sparsity_horizon=3)))
     assert not counts(mampc.MAMPC(problem, PRICE, method="greedy"))
     promised = mampc.Regulator(mampc.MAMPC(replace(problem, tail_horizon=2000.0), PRICE))
     assert promised.value_of_information

@@ -21,7 +21,10 @@ from mampc.loop.load_bank import LoadBank
 from mampc.methods.alternating import Alternating
 from mampc.methods.exact.search import Exact
 
-FEW = 15  # planned moves, up to which all patterns are listed beside later data
+FEW, FEW_SIZED = (
+    15,
+    12,
+)  # planned moves, up to which all patterns are listed beside later data; with least sizes
 
 
 def has_scarce_moves(controller: Controller) -> bool:
@@ -54,7 +57,7 @@ def counts_on_later_data(controller: Controller, estimator: Estimator) -> bool:
     """Whether plans count on later measurements unless told otherwise.
 
     They do with a `LoadBank` where moves have a price and what these will tell is known: for the exact search of a few
-    moves of any size, about set points. A plant that runs away cannot wait.
+    moves, about set points. A plant that runs away cannot wait.
     """
     priced = [one for one in controller.each if type(one) is MAMPC and not one.is_plain]
     return (
@@ -69,9 +72,8 @@ def _knows_what_they_tell(controller: MAMPC) -> bool:
     rules = controller.rules
     return bool(
         isinstance(controller.method, Exact)
-        and controller.condensed.n_moves <= FEW
+        and controller.condensed.n_moves <= (FEW_SIZED if np.any(rules.min_size) else FEW)
         and np.min(rules.price) > 0
-        and not np.any(rules.min_size)
         and rules.levels is None
         and not controller.problem.zoned.any()
     )
