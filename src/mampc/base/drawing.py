@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Okabe and Ito's palette: told apart by the colour-blind and in print.
-BLACK, BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = (
-    "#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9",
+BLACK, BLUE, VERMILION, GREEN, ORANGE, SKY = (
+    "#000000", "#0072b2", "#d55e00", "#009e73", "#e69f00", "#56b4e9",
 )  # fmt: skip
 GREY = "#5c5c5c"
 PALE = ("#a6dccb", "#e8c4d8", "#f5d796", "#bfe0f5", "#c9c9c9", "#e5b8a0")  # of controllers in the background

@@ -85,8 +85,7 @@ def _solved(
     before = as_vector("u_previous", u_previous, m)
     kept = (Limits() if limits is None else limits).checked(m, model.n_outputs)
     low, high = (np.tile(limit - model.u_op, N) for limit in (kept.u_min, kept.u_max))
-    B = model.B[:, :m]
-    reach, free = [B], x
+    reach, free = [model.B[:, :m]], x
     for _ in range(N):
         free = model.A @ free
     for _ in range(N - 1):
@@ -129,10 +128,14 @@ def _solved(
             f"expected a target that can be reached in {N} samples within the limits, received one that cannot: "
             f"{solution.message}"
         )
-    u = solution.x[:k]
-    z = Z @ u + z0
-    path = [x]
-    for inputs in u.reshape(N, m):
-        path.append(model.A @ path[-1] + B @ inputs)
+    inputs = solution.x[:k]
+    return _plan(model, x, inputs.reshape(N, m), Z @ inputs + z0)
+
+
+def _plan(model: StateSpace, x0: Array, u: Array, z: Array) -> OpenLoopPlan:
+    """The plan of inputs u, shape (N, m), whose moves or inputs z count."""
+    path = [x0]
+    for inputs in u:
+        path.append(model.A @ path[-1] + model.B[:, : model.n_inputs] @ inputs)
     beyond = np.abs(z) > ZERO * max(np.abs(z).max(initial=0.0), 1e-300)
-    return OpenLoopPlan(u.reshape(N, m), np.array(path), int(beyond.sum()), float(np.abs(z).sum()))
+    return OpenLoopPlan(u, np.array(path), int(beyond.sum()), float(np.abs(z).sum()))
