@@ -221,6 +221,20 @@ def objective_of(problem, rules, x, past, reference, plan):
     return cost_of(problem, x, past[-1], reference, plan) + charge(rules, moved(np.vstack([past[-1:], plan])))
 
 
+def assert_best_of_all_patterns(problem, rules, x, reference):
+    """The exact method proves the plan that costs least on any pattern, and says what it costs."""
+    sparse = mampc.MAMPC(problem, rules)
+    past = sparse.initial_state().inputs
+    decision = sparse.step(sparse.initial_state(), x, reference)
+    assert decision.status is mampc.Status.OPTIMAL
+    objective = objective_of(problem, rules, x, past, reference, decision.plan)
+    np.testing.assert_allclose(decision.objective, objective, rtol=1e-9)
+    patterns = all_patterns(problem.control_horizon, problem.model.n_inputs)
+    prices = [charge(rules, p) if keeps_rules(rules, past, p) else np.inf for p in patterns]
+    costs = best_on_every_pattern(problem, rules, x, past[-1], reference)
+    np.testing.assert_allclose(decision.objective, min(costs + prices), rtol=1e-6)
+
+
 def scip_bounds(problem, rules, x, u_previous, reference, seconds):
     """Lower and upper bound of the sparse optimum from rest, by SCIP on the big-M form; price and budget alike.
 

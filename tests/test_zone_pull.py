@@ -7,8 +7,10 @@ import pytest
 
 import mampc
 from builders import cost_of, random_model
-from mampc import Status
-from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of
+from referees import (
+    assert_best_of_all_patterns,
+    objective_of,
+)
 from seeds import seeds
 
 INF = np.inf
@@ -32,15 +34,7 @@ def random_problem(seed, **changes):
 def test_the_exact_optimum_is_that_of_brute_force(seed):
     for rules in (mampc.MoveRules(price=0.2), mampc.MoveRules(price=0.05, max_moves=2, sparsity_horizon=2)):
         problem, x, reference, _ = random_problem(seed)
-        sparse = mampc.MAMPC(problem, rules)
-        past = sparse.initial_state().inputs
-        decision = sparse.step(sparse.initial_state(), x, reference)
-        assert decision.status is Status.OPTIMAL
-        objective = objective_of(problem, rules, x, past, reference, decision.plan)
-        assert decision.objective == pytest.approx(objective, rel=1e-9)
-        prices = [charge(rules, p) if keeps_rules(rules, past, p) else INF for p in all_patterns(3, 2)]
-        costs = best_on_every_pattern(problem, rules, x, past[-1], reference)
-        assert decision.objective == pytest.approx(min(costs + prices), rel=1e-6)
+        assert_best_of_all_patterns(problem, rules, x, reference)
 
 
 @pytest.mark.parametrize("seed", seeds(12, quick=4))

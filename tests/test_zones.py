@@ -20,7 +20,12 @@ from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
 from mampc.program.condensing import CondensedQP
 from mampc.program.least_distance import LeastDistance
-from referees import all_patterns, best_on_every_pattern, charge, keeps_rules, objective_of, scip_bounds
+from referees import (
+    assert_best_of_all_patterns,
+    best_on_every_pattern,
+    objective_of,
+    scip_bounds,
+)
 from seeds import examples
 
 INF = np.inf
@@ -99,16 +104,7 @@ def test_the_program_on_a_pattern_is_that_of_squared_distances(seed):
 def test_the_exact_optimum_is_that_of_brute_force(rules):
     for seed in range(3 if rules.min_size else examples(6, quick=3)):
         problem, x, reference, _ = random_problem(seed)
-        sparse = mampc.MAMPC(problem, rules)
-        state = sparse.initial_state()
-        decision = sparse.step(state, x, reference)
-        past = state.inputs
-        assert decision.status is Status.OPTIMAL
-        objective = objective_of(problem, rules, x, past, reference, decision.plan)
-        assert decision.objective == pytest.approx(objective, rel=1e-9)
-        prices = [charge(rules, p) if keeps_rules(rules, past, p) else INF for p in all_patterns(3, 2)]
-        costs = best_on_every_pattern(problem, rules, x, past[-1], reference)
-        assert decision.objective == pytest.approx(min(costs + prices), rel=1e-6)
+        assert_best_of_all_patterns(problem, rules, x, reference)
 
 
 @pytest.mark.parametrize("limited", [False, True])
