@@ -229,6 +229,8 @@ def test_a_unit_behind_every_number_is_its_unit(tmp_path, form, decimal):
         "%b %d, %Y, %I:%M:%S %p", "%m/%d/%Y, %I:%M:%S %p", "%d.%m.%Y, %H:%M:%S", "%d.%m.%Y %H.%M.%S",
         "%d/%m/%Y %I.%M.%S %p", "%d мая %Y %H:%M:%S", "%d mai %Y à %Hh%Mm%S", "%d maja %Y %H:%M:%S",
         "%Y. %m. %d. %H:%M:%S", "%d.%m.%Y klo %H.%M.%S", "%Y-%m-%d kl. %H:%M:%S", "%d %B %Y at %H:%M:%S UTC",
+        "%d мая %Y г., %H:%M:%S", "martes, %d de mayo de %Y %H:%M:%S", "mar. %d mai %Y %H:%M:%S",
+        "%d-%b-%y %I.%M.%S.000000 %p", "%a %b %d %Y %H:%M:%S GMT+0200 (Central European Summer Time)",
     ],
 )  # fmt: skip
 def test_dates_in_words(tmp_path, form):

@@ -33,12 +33,12 @@ HALVES = re.compile(
     r"\s*\b(?:([ap])\.\s?m\b\.?)|\s*(?:(上午|午前|오전|π\.?μ\.?)|(下午|午後|오후|μ\.?μ\.?))\s*", re.IGNORECASE
 )
 HOUR = re.compile(r"(?<!\d)\d{1,2}:\d\d(:\d\d([.,]\d+)?)?")
-TAIL = re.compile(r"\s*(Uhr|\[[\w/+-]+\])$|\s?(UTC|GMT)(?=[+-]\d)")
+TAIL = re.compile(r"\s*(Uhr|\[[\w/+-]+\]|\([^()]*\))$|\s?(UTC|GMT)(?=[+-]\d)")
 OF = re.compile(r"(?<=\w )(de|del) (?=\w)")
 DAY = re.compile(r"^(\d{1,2})\. ?(?=[^\W\d_])")
-AT = re.compile(r",? (?:klo|kl\.?|um|à|at|ore|alle) (?=\d)|, (?=\d)")  # between the date and the time
+AT = re.compile(r",? (?:klo|kl\.?|um|à|at|ore|alle|г\.,?) (?=\d)|, (?=\d)")  # between the date and the time
 HOURS = re.compile(r"(?<![\d:.])(\d{1,2}) ?h ?(\d\d)(?: ?m(?:in)? ?(\d\d) ?s?)?(?!\w)", re.IGNORECASE)
-POINTS = re.compile(r"(?<=\d )(\d{1,2})\.(\d\d)(?:\.(\d\d))?(?![\d.:])")
+POINTS = re.compile(r"(?<=\d )(\d{1,2})\.(\d\d)(?:\.(\d\d(?:\.\d+)?))?(?![\d.:])")
 YEAR_POINT = re.compile(r"^(\d{4})\. ?(\d{1,2})\. ?(\d{1,2})\. ")
 
 
@@ -68,8 +68,9 @@ def plain_date(stamp: str) -> str:
         return " ".join(stamp.translate(KANJI).split()).rstrip(":")
     stamp = OF.sub("", stamp)
     first = WEEKDAY.match(stamp)
-    if first and not (first[2] and _month(first[1])):
-        stamp = stamp[first.end() :]
+    rest = stamp[first.end() :] if first else ""
+    if first and not (first[2] and _month(first[1]) and not any(map(_month, MONTH.findall(rest)))):
+        stamp = rest  # "martes 16 abril", but not "mar 16"
     stamp = JOINED.sub(r"\1 \2", DAY.sub(r"\1 ", stamp))
     stamp = MONTH.sub(lambda found: _month(found.group(1)) or found.group(0), stamp)
     stamp = ZONE.sub(lambda found: " " + ZONES[found.group(1)], stamp)

@@ -44,12 +44,14 @@ def times_of_day(
             example, since_start = example or cell, since_start or found["days"] is not None
             minutes_first = minutes_first or found["part"] is not None
     read, two = np.array(seconds), np.array(short, dtype=bool)
-    minutes_first = minutes_first or bool((read[two] > DAY).any())
+    too_large = bool((read[two] > DAY).any()) and not minutes_first
+    minutes_first = minutes_first or too_large
     if minutes_first:
         read[two] /= 60.0
     if two.any():
         fields = "minutes and seconds" if minutes_first else "hours and minutes"
-        findings.note(f"times such as {example!r} in column {name!r} are {fields}")
+        why = ", as no day has so many hours; if spans of hours, save them with seconds" if too_large else ""
+        findings.note(f"times such as {example!r} in column {name!r} are {fields}{why}")
     if since_start or (read > DAY).any():
         findings.note(f"times in column {name!r} are spans such as {example!r}")
         return read, None
