@@ -30,7 +30,7 @@ def _few_and_short():
         for name in ("ROUNDS", "DEAR_ROUNDS"):
             patch.setattr(tuning, name, SMALL)
         patch.setattr(candidates, "MOVE_WEIGHTS", (0.1,))
-        patch.setattr(scenarios, "LENGTHS", (80, 80))
+        patch.setattr(scenarios, "LENGTHS", (60, 60))
         yield
 
 
