@@ -22,7 +22,7 @@ from mampc.identification.prewhitening import denominator, filtered_by
 from mampc.identification.scaling import Scaled
 
 LAGS = 8  # time constants of what a model may lack
-SLOWER = (0, 1, 2)  # powers of a lag's time constant with which its variance may grow
+SLOWER = (0, 2, 4)  # powers of a lag's time constant with which its variance may grow
 VARIANCES = 10.0 ** np.arange(-8, 2)  # of the slowest lag's gain
 PLENTY = 50_000  # samples that both look at
 PAST, LEAST = 20, 8  # values that make a disturbance white, and samples of a record that says something
