@@ -6,8 +6,9 @@ most, so that few levels come into question for them; what the first samples of 
 node, which has decided the values from some p on, costs at least the squares of its rows.
 
 What is left to decide leads from the present inputs to these values. An input that is elsewhere by then takes a move
-at least. If no input takes more than that, one of few courses is left, which differ in when it moves: they are
-all priced. Any other course has one move more, or two if it leaves an input that is where it has to be.
+at least, or as many as limits of moves ask for. If each takes one at most and none takes more, one of few courses is
+left, which differ in when inputs move: they are all priced. Any other course has one move more, or two if it leaves an
+input that is where it has to be.
 
 Values are counted from the present inputs.
 """
@@ -134,6 +135,7 @@ class LastFirst:
         self._base = np.array([one.least for one in squares])
         self._base += np.square(targets - self._y @ factor.Q.T).sum(axis=1)
         self._next = NextMoves(condensed, rules, of.levels, sample, allowance, past)
+        self._most = self._next.du_max.reshape(-1, self._m).max(axis=0)
         # The present input, which need not be a level, stands for the level that it is at.
         self._own: list[Array] = []
         self._is_level: list[bool] = []
@@ -167,7 +169,7 @@ class LastFirst:
         root, visited = self._root(), 0
         self._finish(root._replace(cost=root.cost + np.square(root.rest).sum(axis=2)))  # without moves
         pending = [(len(self._factor.moves) - 1, root.take(root.bound < self._cutoff))]
-        self._look_ahead(pending[0][1], deadline)
+        self._look_ahead(pending[0][1])
         if self._best is not None and not keeps(self._best):
             return None
         while pending:
@@ -190,7 +192,7 @@ class LastFirst:
         open_ = min((float(nodes.bound.min(initial=np.inf)) for _, nodes in pending), default=np.inf)
         return Found(self._best, self._objective, min(open_, self._objective), not pending, visited)
 
-    def _look_ahead(self, nodes: _Ends, deadline: float) -> None:
+    def _look_ahead(self, nodes: _Ends) -> None:
         """A first plan, by the best few nodes of each value."""
         for p in range(len(self._factor.moves) - 1, -1, -1):
             if not len(nodes.bound):
@@ -219,7 +221,7 @@ class LastFirst:
         factor, dwell = self._factor, self._rules.rules.dwell
         later, (j, a) = int(factor.later[p]), divmod(int(factor.moves[p]), self._m)
         pivot, values = factor.R[p, p], self._values[p]
-        others = (nodes.at != 0) @ np.where(np.arange(self._m) == a, 0.0, self._price)
+        others = self._needed(nodes.at) @ np.where(np.arange(self._m) == a, 0.0, self._price)
         room = np.sqrt(np.maximum(self._cutoff - nodes.cost[:, 0] - nodes.charge - others, 0.0)) / abs(pivot)
         rows, index, waiting = windows(values, nodes.rest[:, 0, p] / pivot, room, nearest)
         v, before, since = values[index], nodes.at[rows, a], nodes.since[rows, a]
@@ -241,10 +243,11 @@ class LastFirst:
         at[:, a] = v
         cost = nodes.cost[rows] + np.square(nodes.rest[rows, :, p] - pivot * v[:, None])
         charge, used = nodes.charge[rows] + self._price[a] * moved, nodes.used[rows] + moved
-        bound = cost.max(axis=1) + charge + (at != 0) @ self._price
+        needed = self._needed(at)
+        bound = cost.max(axis=1) + charge + needed @ self._price
         may: BoolArray = bound < self._cutoff
         if self._left is not None:
-            may &= used + np.count_nonzero(at, axis=1) <= self._left
+            may &= used + needed.sum(axis=1) <= self._left
         children = nodes.take(rows[may])._replace(
             at=at[may], cost=cost[may], charge=charge[may], used=used[may], bound=bound[may]
         )
@@ -256,20 +259,24 @@ class LastFirst:
             children = children.take(children.bound < self._cutoff)
         return children, left
 
+    def _needed(self, at: Array) -> Array:
+        """How many moves inputs take at least to these values, shape (K, m)."""
+        return np.asarray(np.maximum(np.ceil(np.abs(at) / self._most), at != 0))
+
     def _with_few_more(self, p: int, nodes: _Ends, every: bool) -> _Ends:
         """The nodes bounded by what it costs to move no more than they have to, and by a move more.
 
         Those alone that this may rule out, or `every` one.
         """
-        moving = nodes.at != 0
+        moving, needed = nodes.at != 0, self._needed(nodes.at)
         moves = np.where(moving, 1, 2)
         extra: Array = moves * self._price
         if self._left is not None:
-            left = self._left - nodes.used - moving.sum(axis=1)
+            left = self._left - nodes.used - needed.sum(axis=1)
             extra = np.where(moves <= left[:, None], extra, np.inf)
         more, jumps = extra.min(axis=1), self._factor.jumps(p)
         paid, bound = nodes.charge + moving @ self._price, nodes.bound.copy()
-        looked = np.flatnonzero(every | (bound + more >= self._cutoff))
+        looked = np.flatnonzero((needed <= 1).all(axis=1) & (every | (bound + more >= self._cutoff)))
         sets = moving[looked] @ 2 ** np.arange(self._m)
         for each in np.unique(sets):
             alike = looked[sets == each]
