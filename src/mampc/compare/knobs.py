@@ -62,9 +62,7 @@ def variants(table: ControllerTable, points: int) -> list[tuple[float, Controlle
             changed = {"rules": own.model_copy(update={name: value})}
         else:
             changed = {"settings": own | {name: value}}
-        number = (
-            float(value) if isinstance(value, int) else factor if isinstance(value, list) else float(value)
-        )
+        number = factor if isinstance(value, list) else float(value)
         found[key] = (number, table.model_copy(update=changed))
     return list(found.values())
 
