@@ -17,7 +17,7 @@ from scipy.linalg import expm
 
 import mampc
 from mampc.compare.fronts import Point
-from mampc.compare.promise import by_kind, error_ratio, moves_per_hour
+from mampc.compare.promise import by_kind, moves_per_hour, ratio_over_kinds
 from mampc.compare.scenarios import Scenarios, Surroundings, even_weight
 from measuring import options
 
@@ -78,7 +78,7 @@ def kept(name: str, seed: int, share: float | None, jobs: int) -> bool:
     around = Surroundings.of(tuned.baseline.controller.problem, None, None, None)
     fresh, kinds = Scenarios.drawn(tuned.baseline, around, FRESH, (seed, 77)), len(around.loads)
     base, own = (Point("", 0.0, *fresh.run(one)) for one in (tuned.baseline, tuned.regulator))
-    ratio, moves = error_ratio(own, base, kinds), moves_per_hour(own, fresh.hours)
+    ratio, moves = ratio_over_kinds(own, base, kinds), moves_per_hour(own, fresh.hours)
     used, promised = (
         (ratio, tuned.expected.error_ratio) if share is None else (moves, tuned.expected.moves_per_hour)
     )

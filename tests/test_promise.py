@@ -21,11 +21,11 @@ def in_turn(*errors):
 
 def test_kinds_of_load_count_alike_and_a_better_one_makes_up_for_no_other():
     point, base = in_turn(0.0, 3.0)
-    assert promise.error_ratio(point, base, 2).value == pytest.approx(2.0)
-    assert promise.error_ratio(point, base).value == pytest.approx(1.5)
+    assert promise.ratio_over_kinds(point, base, 2).value == pytest.approx(2.0)
+    assert promise.ratio_over_kinds(point, base).value == pytest.approx(1.5)
     large = Point("", 1.0, point.moves, point.error * np.tile([1.0, 100.0], 8))
     under = Point("", 0.0, base.moves, np.tile([1.0, 100.0], 8))
-    assert promise.error_ratio(large, under, 2).value == pytest.approx(2.0)
+    assert promise.ratio_over_kinds(large, under, 2).value == pytest.approx(2.0)
 
 
 def test_a_kind_of_load_with_more_error_than_allowed_is_named():

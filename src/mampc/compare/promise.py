@@ -40,7 +40,7 @@ class Goal:
     def used(self, point: Point, baseline: Point) -> Estimate:
         """The share of what is allowed that a setting uses, 1 for all of it."""
         if self.max_error_increase is not None:
-            ratio = error_ratio(point, baseline, self.kinds)
+            ratio = ratio_over_kinds(point, baseline, self.kinds)
             return Estimate(
                 (ratio.value - 1) / self.max_error_increase, ratio.standard_error / self.max_error_increase
             )
@@ -83,7 +83,7 @@ class Goal:
         return BACK if self.max_error_increase is not None else 1 / BACK
 
 
-def error_ratio(point: Point, baseline: Point, kinds: int = 1) -> Estimate:
+def ratio_over_kinds(point: Point, baseline: Point, kinds: int = 1) -> Estimate:
     """The error over that of plain MPC in the same loops, a mean over the kinds of load that loops take in turn.
 
     A kind under which it is below 1 counts as 1, so that it makes up for no other.
@@ -150,7 +150,7 @@ class Expected:
         """From runs in scenarios, which take these kinds of load in turn."""
         allowed = None if goal.max_error_increase is None else 1 + goal.max_error_increase
         return cls(
-            moves_per_hour(point, goal.hours), error_ratio(point, baseline, len(loads)),
+            moves_per_hour(point, goal.hours), ratio_over_kinds(point, baseline, len(loads)),
             moves_per_hour(baseline, goal.hours), len(point.error), tuple(map(in_words, loads)),
             by_kind(point, baseline, len(loads)), allowed,
         )  # fmt: skip

@@ -17,7 +17,7 @@ from mampc.base.checks import Array, as_number, as_whole
 from mampc.base.errors import MampcError
 from mampc.compare.candidates import Candidate, candidates
 from mampc.compare.fronts import Estimate, Point, non_dominated
-from mampc.compare.promise import Expected, Goal, error_ratio, moves_per_hour
+from mampc.compare.promise import Expected, Goal, moves_per_hour, ratio_over_kinds
 from mampc.compare.rounds import DEAR_ROUNDS, FINALISTS, HIGHER, ROUNDS, Work
 from mampc.compare.scenarios import Scenarios, Surroundings
 from mampc.controllers import MAMPC, MPC, ControllerBank
@@ -344,7 +344,7 @@ def _nearest(
 
 
 def _front(points: Sequence[Point], base: Point, goal: Goal) -> tuple[FrontPoint, ...]:
-    ratios = [error_ratio(point, base, goal.kinds) for point in points]
+    ratios = [ratio_over_kinds(point, base, goal.kinds) for point in points]
     moves, errors = np.array([p.moves.mean() for p in points]), np.array([r.value for r in ratios])
     return tuple(
         FrontPoint(points[i].value, moves_per_hour(points[i], goal.hours), ratios[i])
