@@ -104,8 +104,7 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
             )
             return None
         findings.change(
-            f"no time can be read in {rows_text(sheet.numbers[unreadable].tolist())} "
-            f"(the first says {cell}); left out"
+            f"no time can be read in {rows_text(sheet.numbers[unreadable])} (the first says {cell}); left out"
         )
         if len(unreadable) > 0.1 * len(seconds):
             findings.doubt(

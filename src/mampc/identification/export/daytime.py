@@ -79,7 +79,7 @@ def on_next_days(
     again = way * steps < 0
     if not again.any():
         return seconds
-    rows = rows_text(sheet.numbers[known[1:][again]].tolist())
+    rows = rows_text(sheet.numbers[known[1:][again]])
     if period == HOUR:
         findings.doubt(
             f"times such as {example!r} in column {name!r} have no hour and no date, and begin again in {rows}; save "
@@ -117,7 +117,7 @@ def doubt_half_days(seconds: Array, name: str, sheet: Sheet, findings: Findings)
     usual = float(np.median(steps[steps > 0]))
     noon = np.flatnonzero((steps < 0) & (np.abs(steps - usual + DAY / 2) <= 0.3 * usual))
     if len(noon):
-        rows = rows_text(sheet.numbers[known[noon + 1]].tolist())
+        rows = rows_text(sheet.numbers[known[noon + 1]])
         findings.doubt(
             f"times in column {name!r} go back twelve hours before {rows}; "
             "save them with 24 hours a day, or with AM and PM"

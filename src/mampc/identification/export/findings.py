@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
 
 from mampc.base.errors import MampcError
 
@@ -56,16 +59,10 @@ class Findings:
         raise MampcError("\n".join([f"{self.origin}: {len(self.doubts)} things to decide first", *lines]))
 
 
-def rows_text(numbers: Iterable[int], count: int | None = None) -> str:
+def rows_text(numbers: Sequence[int] | npt.NDArray[np.int64]) -> str:
     """ "row 3", "rows 3, 9 and 12" or "rows 3, 9, 12, 14, 15 and 30 more"."""
-    first = []
-    for number in numbers:
-        first.append(str(number))
-        if len(first) == MOST_SHOWN + 1:
-            break
-    total = len(list(numbers)) if count is None and hasattr(numbers, "__len__") else count or len(first)
-    if total == 1:
+    first, more = [str(number) for number in numbers[:MOST_SHOWN]], len(numbers) - MOST_SHOWN
+    if len(numbers) == 1:
         return f"row {first[0]}"
-    if total > MOST_SHOWN:
-        return f"rows {', '.join(first[:MOST_SHOWN])} and {total - MOST_SHOWN} more"
-    return f"rows {', '.join(first[:-1])} and {first[-1]}"
+    last = f"{more} more" if more > 0 else first.pop()
+    return f"rows {', '.join(first)} and {last}"

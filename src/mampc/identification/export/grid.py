@@ -128,7 +128,7 @@ def pieces(
     cuts = np.flatnonzero(steps > fill + GAP)
     closed = np.flatnonzero((steps > GAP) & (steps <= fill + GAP))
     if len(closed):
-        rows = rows_text(numbers[grid.order[kept[closed]]].tolist())
+        rows = rows_text(numbers[grid.order[kept[closed]]])
         findings.change(
             f"{counted(len(closed), 'gap')} of up to {counted(fill, 'sample')} closed, after {rows}"
         )

@@ -288,7 +288,7 @@ class _Reader:
                 self._drop(values == mark, rows)
             elif distance > 0:
                 findings.doubt(
-                    f"{name}: {mark:g} in {rows_text(rows[values == mark].tolist())} may be a value or a mark for a "
+                    f"{name}: {mark:g} in {rows_text(rows[values == mark])} may be a value or a mark for a "
                     "missing one; name it in bad (--bad), or state a range that holds it (--range)"
                 )
 

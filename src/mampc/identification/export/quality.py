@@ -137,8 +137,8 @@ def drop_bad_quality(
     good: Iterable[str],
     measured: Collection[str],
     findings: Findings,
-) -> tuple[int, ...]:
-    """Leave no number whose quality is not known to be good; returns the columns that say so.
+) -> None:
+    """Leave no number whose quality is not known to be good.
 
     Args:
         sheet: the table.
@@ -149,8 +149,7 @@ def drop_bad_quality(
         findings: receives a doubt where no word is known.
     """
     by_name = {column.name: column for column in columns}
-    speaking = quality_columns(sheet, positions, measured)
-    for at, names in speaking.items():
+    for at, names in quality_columns(sheet, positions, measured).items():
         words = [word.casefold() for word in sheet.words(at)]
         denies = DENIAL.search(sheet.header[at].casefold()) is not None
         named = [str(word).strip().casefold() for word in good]
@@ -172,7 +171,6 @@ def drop_bad_quality(
                 column.mark(f"quality {shown(words[i])}", int(sheet.numbers[i]))
             column.values[~is_good] = np.nan
         findings.note(f"column {sheet.header[at]!r} taken as the quality of {', '.join(names)}")
-    return tuple(speaking)
 
 
 def _in_numbers(name: str, words: Sequence[str]) -> tuple[str, ...]:
