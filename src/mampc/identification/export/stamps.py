@@ -142,9 +142,8 @@ def _read_orders(
     blocks: Iterable[list[str]], how: TimeReading, name: str, findings: Findings
 ) -> tuple[dict[str, _Order], str, bool]:
     """The stamps in each order of day and month in which any can be read, the first one, and if they have offsets."""
-    zone = (" %z", "%z", "")
     orders = {
-        order: _Order([f"{day}{time}{end}" for day, time, end in product(days, TIMES, zone)])
+        order: _Order([f"{day}{time}" for day, time in product(days, TIMES)])
         for order, days in ORDERS.items()
     }
     if how.time_format is not None:
@@ -205,15 +204,18 @@ class _Order:
 
     def _find(self, left: Any, utc: bool) -> bool:
         """Add a format that fits one of the cells; two of each pattern of digits and letters stand for the others."""
+        import pandas as pd
+
         if len(self.fitting) == MOST_FORMATS:
             return False
         kinds: dict[str, list[str]] = {}
         for cell in left.iloc[:50]:
             kinds.setdefault(LETTER.sub("a", DIGIT.sub("0", cell)), []).append(cell)
-        for kind in kinds.keys() - self.strange:
-            for cell, form in product({kinds[kind][0], kinds[kind][-1]}, self.formats):
-                if form not in self.fitting and _parsed([cell], form, utc).notna().all():
-                    self.fitting.append(form)
+        ends = (" %z", "%z", "") if utc else ("",)
+        for kind in [kind for kind in kinds if kind not in self.strange]:
+            for cell, form, end in product((kinds[kind][0], kinds[kind][-1]), self.formats, ends):
+                if form + end not in self.fitting and _parsed(cell, form + end, utc) is not pd.NaT:
+                    self.fitting.append(form + end)
                     return True
             self.strange.add(kind)
         return False
@@ -223,7 +225,7 @@ def _parsed(words: Any, form: str, utc: bool) -> Any:
     import pandas as pd
 
     try:
-        return pd.Series(pd.to_datetime(words, format=form, errors="coerce", utc=utc))
+        return pd.to_datetime(words, format=form, errors="coerce", utc=utc)
     except ValueError as error:
         raise MampcError(f"time_format: expected a format as strptime has it, received {error}") from None
 
