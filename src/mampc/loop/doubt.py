@@ -20,15 +20,15 @@ def moves_of_late(model: StateSpace) -> Array:
     """From `BankEstimate.late` and the inputs u (m,) applied since to the next one, both of l + N m + m numbers.
 
     A move du of a samples ago has done S_a du to an output, and counts in h for exp(-(a - d) / LATE) of that once the
-    dead time d of this input and output is over: what comes later than expected shows no sooner. A plant that runs away
-    cannot wait: there moves cast no doubt.
+    dead time d of this input and output is over: what comes later than expected shows no sooner.
+    Integrators in a row, which nothing else holds, go far while plans wait: their moves cast no doubt.
     """
     n, m, l = model.n_states, model.n_inputs, model.n_outputs
     faded = int(np.ceil(-LATE * np.log(FADED)))
     done = model.step_response(n + faded + 2)[1:, :, :m]
     answers = np.abs(done) > NEGLIGIBLE * np.abs(done[: n + 1]).max(axis=0)
     dead = answers.argmax(axis=0)
-    if runs_away(model):
+    if runs_away(model) and not grows(model):
         done[:] = dead[:] = 0
     count = int(dead.max(initial=0)) + faded
     since = np.arange(1, count + 1)[:, None, None] - dead
@@ -37,6 +37,11 @@ def moves_of_late(model: StateSpace) -> Array:
     _, moves, before, u = np.split(np.eye(l + (count + 2) * m), np.cumsum([l, count * m, m]))
     moves = np.vstack([u - before, moves[: (count - 1) * m]])
     return np.vstack([counts.transpose(1, 0, 2).reshape(l, -1) @ moves, moves, u])
+
+
+def grows(model: StateSpace) -> bool:
+    """Whether a mode grows by itself, other than integrators."""
+    return bool(np.abs(model.poles()).max(initial=0.0) > 1 + INTEGRATES)
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -10,13 +10,13 @@ with the innovation e_b of filter b and its covariance S_b. These hold up to one
 tell: loads are told in units of the noise, so noise that was told wrongly changes no gain.
 
 A plant may do what inputs ask for later, or more or less of it, than its model says. By what the inputs' moves of the
-last samples did to the outputs, dead times aside, h, their innovations may be off: these vary by
-1 / t_b = 1 + h' diag(S_b^-1) h / l times as much, and what is corrected falls by as much. Meanwhile plans count on the
-bank with the weight t = sum_b mu_b t_b, and for the rest on the plain filter that a regulator would have without a
-bank: that one follows slowly, and in one way whatever happens, so that a wrong model costs little more with a bank than
-without. The factor of the noise counts up to one here: errors of the model, which make it larger, are no reason for
-less caution. Where the noise was guessed it counts as the least it can be, since moves may be far above the noise and
-within its guess.
+last samples did to the outputs, dead times aside, h, their innovations may be off: these vary by 1 / t_b = 1 + h'
+diag(S_b^-1) h / l times as much, and what is corrected falls by as much (but where modes of the plant grow, and errors
+would with them). Meanwhile plans count on the bank with the weight t = sum_b mu_b t_b, and for the rest on the plain
+filter that a regulator would have without a bank: that one follows slowly, and in one way whatever happens, so that a
+wrong model costs little more with a bank than without. The factor of the noise counts up to one here: errors of the
+model, which make it larger, are no reason for less caution. Where the noise was guessed it counts as the least it can
+be, since moves may be far above the noise and within its guess.
 
 Source: Blom and Bar-Shalom, IEEE Trans. Automatic Control 33 (1988), the interacting multiple model filter, here with
 stationary gains, and with jumps that give way to what held before them.
@@ -31,7 +31,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
-from mampc.loop.doubt import moves_of_late
+from mampc.loop.doubt import grows, moves_of_late
 from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
@@ -113,6 +113,7 @@ class LoadBank(Estimator):
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
         self._of_late, self._moved = moves_of_late(model), slice(l)
+        self._grows = grows(model)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         # The members' models differ in how s goes on: all may have the same A once their mixed z are multiplied by
         # `_begins` before, and by `_goes_on` after.
@@ -235,7 +236,7 @@ class LoadBank(Estimator):
                 c, surprise, moved, filters, bank.usual, bank.scale
             )
             correction = (innovations @ filters.gains.T).reshape(mixed.shape)
-            members = each[:, :, :n_z] * self._goes_on + trust[..., None] * correction
+            members = each[:, :, :n_z] * self._goes_on + self._damped(trust)[..., None] * correction
             counts = (weights * trust).sum(axis=1, keepdims=True)
             estimate = self._estimate(members, weights, usual, scale, late, plain, counts)
         return Updated(estimate, seen[:, :l], seen[:, l:])
@@ -324,9 +325,13 @@ class LoadBank(Estimator):
         moved = filters.precisions.dot(np.square(late[self._moved]))
         trust, weights, usual, scale = self._mixing.one(c, surprise, moved, filters, bank.usual, bank.scale)
         correction = filters.gains.dot(innovations).reshape(members.shape)
-        correction *= trust[:, None]
+        correction *= self._damped(trust)[:, None]
         correction += members
         return self._estimate(correction, weights, usual, scale, late, plain, weights.dot(trust))
+
+    def _damped(self, trust: Array) -> Array:
+        """By what hypotheses correct less: not at all where a mode grows, as their errors would."""
+        return np.ones_like(trust) if self._grows else trust
 
     def _counts(self, weights: Array, late: Array, scale: Array) -> float:
         """t of the bank, with every output believed."""
