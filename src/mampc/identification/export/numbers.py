@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -132,6 +133,14 @@ def read_numbers(
     return [reader.finish(sheet.numbers, findings, switches) for reader in readers], values
 
 
+class _Cells(NamedTuple):
+    """Cells with one unit behind their numbers: the first one, positions and numbers."""
+
+    first: str
+    places: array[int]
+    numbers: array[float]
+
+
 class _Reader:
     """Reads one column chunk by chunk."""
 
@@ -145,7 +154,7 @@ class _Reader:
         self.states: dict[str, array[int]] = {}  # positions of words such as ON
         self.apart: list[tuple[int, str]] = []  # positions and cells such as 1 234
         self.spaced = False  # whether spaces are known to stand between thousands
-        self.units: dict[str, list[tuple[int, str, str]]] = {}  # positions, numbers and cells such as 12 %
+        self.units: dict[str, _Cells] = {}  # such as 12 %, by what stands behind the number
 
     def read(self, start: int, cells: Cells, rows: npt.NDArray[np.int64]) -> None:
         values = self.column.values[start : start + len(cells)]
@@ -235,7 +244,9 @@ class _Reader:
         else:
             number, unit = without_unit(word)
             if unit and (POINT.fullmatch(number) or GROUPED_FOR_SURE.fullmatch(number)):
-                self.units.setdefault(unit, []).append((at, number.replace(",", ""), cell))
+                alike = self.units.setdefault(unit, _Cells(cell, array("q"), array("d")))
+                alike.places.append(at)
+                alike.numbers.append(float(number.replace(",", "")))
             else:
                 self.unclear.setdefault(cell, []).append(row)
         return np.nan
@@ -244,15 +255,13 @@ class _Reader:
         """Numbers with a unit behind them count where each number of the column has it, and the same one."""
         column = self.column
         if len(self.units) == 1 and not (self.unclear or self.either) and np.isnan(column.values).all():
-            [(unit, cells)] = self.units.items()
-            for at, number, _ in cells:
-                column.values[at] = float(number)
+            [(unit, alike)] = self.units.items()
+            column.values[np.frombuffer(alike.places, dtype=np.int64)] = alike.numbers
             column.unit = unit.translate(SWAPPED) if self.decimal == "," else unit
             findings.note(f"{column.name}: {shown(column.unit)} stands behind each number, read as its unit")
             return
-        for cells in self.units.values():
-            for at, _, cell in cells:
-                self.unclear.setdefault(cell, []).append(int(rows[at]))
+        for alike in self.units.values():
+            self.unclear.setdefault(alike.first, []).extend(rows[list(alike.places)].tolist())
 
     def _take_states(self, findings: Findings) -> None:
         """Two states in words as 0 and 1, where there is no number."""
