@@ -75,6 +75,8 @@ def test_units_behind_names_may_be_left_out(tmp_path):
 
 MARKS = (
     "Bad", "bad input", "No Data", "I/O Timeout", "", "NaN", "inf", "-Infinity", "1e999", "-9999", "-9999.0", "#N/A",
+    "Bad Input", "1.#QNAN", "-1.#IND", "Configure", "Pt Created", "Scan Off", "Arc Off-line", "Calc Failed", "????",
+    "---", "(null)", "<null>", "1e38", "#REF!", "ERR 14", "12.3 BAD", "65535", "-999.25", "∞", "нет данных", "不良",
     "1.#IND", "null", "Open", "--", "9.9e37", "[-11059] No Good Data For Calculation", "1e13",
 )  # fmt: skip
 

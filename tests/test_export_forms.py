@@ -268,21 +268,6 @@ def test_what_is_said_behind_good_keeps_it_good(tmp_path, word):
     assert [len(record) for record in read(tmp_path, content).records] == [9, 10]
 
 
-@pytest.mark.parametrize(
-    "mark",
-    [
-        "Bad", "Bad Input", "-9999", "1.#QNAN", "-1.#IND", "NULL", "#N/A", "Configure", "Pt Created", "No Data",
-        "I/O Timeout", "Scan Off", "Arc Off-line", "Calc Failed", "????", "---", "(null)", "<null>", "1e38", "#REF!",
-        "ERR 14", "12.3 BAD", "65535", "-999.25", "∞", "[-11059] No Good Data For Calculation",
-    ],
-)  # fmt: skip
-def test_no_number_comes_from_a_mark(tmp_path, mark):
-    content = rows(lambda k, u, y: f"{stamp(k)},{u},{mark if k == 9 else y}", ["time,u,y"])
-    export = read(tmp_path, content)
-    assert [len(record) for record in export.records] == [9, 10]
-    assert any(note.startswith("y: no number in 1 of 20 rows") and "row 11" in note for note in export.notes)
-
-
 def test_worksheets_with_the_same_columns_are_asked_about(tmp_path):
     openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()
