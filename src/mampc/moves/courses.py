@@ -184,10 +184,12 @@ def windows(
     room: Array,
     nearest: int | None,
     may: BoolArray | None = None,
+    together: int = TOGETHER,
 ) -> tuple[Indices, Indices, int]:
     """Nodes and indices of values, which are in order, within `room` of `centre`; the first node that has to wait.
 
     Both of shape (K,); with `nearest` only so many values of each node, and none of those that may not, shape (K,).
+    Else about so many values `together`.
     """
     most, count = len(values), len(centre)
     first = np.searchsorted(values, centre - room)
@@ -198,7 +200,7 @@ def windows(
         end = np.minimum(end, np.maximum(first, first + nearest))
     counts = end - first if may is None else np.where(may, end - first, 0)
     totals = np.cumsum(counts + 1)
-    waiting = count if nearest is not None else max(1, int(np.searchsorted(totals, TOGETHER, side="right")))
+    waiting = count if nearest is not None else max(1, int(np.searchsorted(totals, together, side="right")))
     waiting = min(waiting, count)
     counts = counts[:waiting]
     rows = np.repeat(np.arange(waiting), counts)

@@ -26,7 +26,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray
 from mampc.base.tolerances import tie
 from mampc.moves.admissible import Allowance
-from mampc.moves.courses import Found, NextMoves, Past, windows
+from mampc.moves.courses import TOGETHER, Found, NextMoves, Past, windows
 from mampc.program.sample import Indices, LeastSquares, Sample
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ BEAM = 16  # nodes of each value that the first plan is looked for among
 NEAREST = 5  # levels that it tries for each
 COURSES = 1000  # that are priced for one node
 AT_ONCE = 2**17  # courses that are priced at once
+WAITING = 2**24  # numbers in the nodes that wait
 LOST = 1e-14  # of squares that are added up: what rounding may make of them
 LATER = 1_000_000  # samples
 
@@ -78,6 +79,7 @@ class ValueFactor:
         moves: shape (k,).
         later: the next move of the same input, as a position, -1 for none, shape (k,).
         first: whether it is the first one of its input, shape (k,).
+        own: positions of each input's moves.
         complete: the last position from which on every input that moves has a value.
         Q: orthonormal columns, shape (rows, k).
         R: upper triangular, shape (k, k).
@@ -85,7 +87,7 @@ class ValueFactor:
 
     def __init__(self, U: Array, moves: Indices, m: int) -> None:
         k, at = len(moves), np.full(m, -1)
-        self.moves, self._m, self._jumps = moves, m, dict[int, list[Array]]()
+        self.moves, self.own = moves, [np.flatnonzero(moves % m == a) for a in range(m)]
         self.later, self.first = np.full(k, -1), np.ones(k, dtype=bool)
         for p in range(k - 1, -1, -1):
             self.later[p], at[moves[p] % m] = at[moves[p] % m], p
@@ -93,17 +95,17 @@ class ValueFactor:
         self.complete = int(np.flatnonzero(self.later < 0).min(initial=k))
         self.Q, self.R = np.linalg.qr(U[:, moves] - U[:, moves[self.later]] * (self.later >= 0))
 
-    def jumps(self, p: int) -> list[Array]:
-        """For each input, what courses that jump by one add to the rows before p, shape (p, jumps).
+    def jumps(self, p: int, a: int) -> Array:
+        """What courses of input a that jump by one add to the rows before p, shape (p, jumps).
 
         At each of its values there, and not before p.
         """
-        kept = self._jumps.get(p)
-        if kept is None:
-            own = [self.R[:p, np.flatnonzero(self.moves[:p] % self._m == a)] for a in range(self._m)]
-            sums = [np.cumsum(columns[:, ::-1], axis=1)[:, ::-1] for columns in own]
-            kept = self._jumps[p] = [np.hstack([columns, np.zeros((p, 1))]) for columns in sums]
-        return kept
+        columns = self.R[:p, self.own[a][: self.before(p, a)]]
+        return np.hstack([np.cumsum(columns[:, ::-1], axis=1)[:, ::-1], np.zeros((p, 1))])
+
+    def before(self, p: int, a: int) -> int:
+        """How many values of input a there are before p."""
+        return int(np.searchsorted(self.own[a], p))
 
 
 class LastFirst:
@@ -135,6 +137,8 @@ class LastFirst:
         self._base = np.array([one.least for one in squares])
         self._base += np.square(targets - self._y @ factor.Q.T).sum(axis=1)
         self._next = NextMoves(condensed, rules, of.levels, sample, allowance, past)
+        # Nodes of every value wait at once.
+        self._together = min(TOGETHER, WAITING // max(len(factor.moves), 1) ** 2)
         self._most = self._next.du_max.reshape(-1, self._m).max(axis=0)
         # The present input, which need not be a level, stands for the level that it is at.
         self._own: list[Array] = []
@@ -205,7 +209,7 @@ class LastFirst:
     def _root(self) -> _Ends:
         m, moves, keeps = self._m, self._factor.moves, True
         for a in range(m):  # an input stays until its first move
-            own = moves[moves % m == a]
+            own = moves[self._factor.own[a]]
             keeps &= bool(
                 self._next.within(a, 0, int(own[0]) // m if len(own) else None, self._u[a : a + 1]).all()
             )
@@ -223,7 +227,9 @@ class LastFirst:
         pivot, values = factor.R[p, p], self._values[p]
         others = self._needed(nodes.at) @ np.where(np.arange(self._m) == a, 0.0, self._price)
         room = np.sqrt(np.maximum(self._cutoff - nodes.cost[:, 0] - nodes.charge - others, 0.0)) / abs(pivot)
-        rows, index, waiting = windows(values, nodes.rest[:, 0, p] / pivot, room, nearest)
+        rows, index, waiting = windows(
+            values, nodes.rest[:, 0, p] / pivot, room, nearest, together=self._together
+        )
         v, before, since = values[index], nodes.at[rows, a], nodes.since[rows, a]
         moved: BoolArray = np.zeros(len(rows), dtype=bool)
         kept = ~moved
@@ -274,16 +280,16 @@ class LastFirst:
         if self._left is not None:
             left = self._left - nodes.used - needed.sum(axis=1)
             extra = np.where(moves <= left[:, None], extra, np.inf)
-        more, jumps = extra.min(axis=1), self._factor.jumps(p)
+        more = extra.min(axis=1)
         paid, bound = nodes.charge + moving @ self._price, nodes.bound.copy()
         looked = np.flatnonzero((needed <= 1).all(axis=1) & (every | (bound + more >= self._cutoff)))
         sets = moving[looked] @ 2 ** np.arange(self._m)
         for each in np.unique(sets):
             alike = looked[sets == each]
-            inputs = np.flatnonzero(moving[alike[0]])
-            own = [jumps[a] for a in inputs]
-            if (courses := prod(jump.shape[1] for jump in own)) > COURSES:
+            inputs = np.flatnonzero(moving[alike[0]]).tolist()
+            if (courses := prod(self._factor.before(p, a) + 1 for a in inputs)) > COURSES:
                 continue
+            own = [self._factor.jumps(p, a) for a in inputs]
             for rows in np.array_split(alike, 1 + len(alike) * courses // AT_ONCE):
                 least = _least_squares(nodes.rest[rows, :, :p], nodes.at[rows][:, inputs], own)
                 least = (nodes.cost[rows] + np.minimum(least, more[rows, None])).max(axis=1) + paid[rows]
