@@ -38,6 +38,9 @@ SYSTEMS = {
     "Fortran": text([[time, f"{float(u):.4E}".replace("E", "D"), y] for time, u, y in rows()]),
     "zeros at the end": text(rows()) + "\0" * 500,
     "columns between spaces, the date and the time under one name": text(rows(), "  ", ("time", "u", "y")),
+    "spans and means around the numbers": text(
+        [["Low", "0", "0"], ["High", "100", "50"], *rows(), ["Average", "6", "20"], ["", "72", "240"]]
+    ),
     "durations of MATLAB in seconds": text([[f"{60 * k} sec", u, y] for k, (_, u, y) in enumerate(rows())]),
     "durations of MATLAB": text([[f"{k} min", u, y] for k, (_, u, y) in enumerate(rows())]),
 }  # fmt: skip

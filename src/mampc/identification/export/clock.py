@@ -94,9 +94,9 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
     doubt_half_days(seconds, name, sheet, findings)
     unreadable = np.flatnonzero(np.isnan(seconds))
     if len(unreadable):
-        first = int(unreadable[0])
-        cell = shown(" ".join(sheet.words(at)[first] for at in columns))
-        row = f"row {sheet.numbers[first]}"
+        parts = [sheet.words(at) for at in columns]
+        words = [" ".join(part[i] for part in parts) for i in unreadable.tolist()]
+        cell, row = shown(words[0]), f"row {sheet.numbers[unreadable[0]]}"
         if len(unreadable) == len(seconds):
             findings.doubt(
                 f"expected times in column {name!r}, received {cell} in {row}; "
@@ -106,7 +106,8 @@ def read_clock(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: F
         findings.change(
             f"no time can be read in {rows_text(sheet.numbers[unreadable])} (the first says {cell}); left out"
         )
-        if len(unreadable) > 0.1 * len(seconds):
+        strange = sum(any(map(str.isdigit, word)) for word in words)  # no time is without a digit
+        if strange > 0.1 * len(seconds) or len(unreadable) > 0.5 * len(seconds):
             findings.doubt(
                 f"expected times in column {name!r}, received others such as {cell} in {len(unreadable)} of "
                 f"{len(seconds)} rows, first in {row}; pass their format (--time-format)"
