@@ -9,6 +9,9 @@ all others are decided, and a program finds them then.
 Limits of outputs come in twice: by multipliers, which make another least-squares problem that no course undercuts, so
 that a node has the larger of two bounds; and by what the moves decided make of the outputs up to there.
 
+Where no rule looks at how a course begins, its end is decided first (see `last_first`); this search takes over where
+what that finds goes beyond limits of outputs.
+
 Source of the enumeration: Agrell, Eriksson, Vardy, Zeger: Closest point search in lattices, IEEE Transactions on
 Information Theory 48 (2002).
 """
