@@ -19,18 +19,17 @@ from collections.abc import Callable
 from itertools import combinations
 from math import prod
 from time import perf_counter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.base.tolerances import tie
-from mampc.moves.admissible import Allowance
+from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.moves.courses import TOGETHER, Found, NextMoves, Past, windows
+from mampc.program.condensing import CondensedQP
+from mampc.program.levels import InputLevels
 from mampc.program.sample import Indices, LeastSquares, Sample
-
-if TYPE_CHECKING:
-    from mampc.moves.level_search import LevelSearch
 
 BEAM = 16  # nodes of each value that the first plan is looked for among
 NEAREST = 5  # levels that it tries for each
@@ -113,7 +112,9 @@ class LastFirst:
 
     def __init__(
         self,
-        of: LevelSearch,
+        condensed: CondensedQP,
+        rules: AdmissiblePatterns,
+        levels: InputLevels,
         sample: Sample,
         factor: ValueFactor,
         allowance: Allowance,
@@ -122,7 +123,6 @@ class LastFirst:
         paid: bool,
         cutoff: float,
     ) -> None:
-        condensed, rules = of.condensed, of.admissible
         self._sample, self._factor, self._rules, self._paid = sample, factor, rules, paid
         self._m, self._u = rules.n_inputs, sample.u_previous
         self._left = allowance.left if rules.rules.max_moves is not None else None
@@ -136,17 +136,17 @@ class LastFirst:
         self._y = targets @ factor.Q
         self._base = np.array([one.least for one in squares])
         self._base += np.square(targets - self._y @ factor.Q.T).sum(axis=1)
-        self._next = NextMoves(condensed, rules, of.levels, sample, allowance, past)
+        self._next = NextMoves(condensed, rules, levels, sample, allowance, past)
         # Nodes of every value wait at once.
         self._together = min(TOGETHER, WAITING // max(len(factor.moves), 1) ** 2)
         self._most = self._next.du_max.reshape(-1, self._m).max(axis=0)
         # The present input, which need not be a level, stands for the level that it is at.
         self._own: list[Array] = []
         self._is_level: list[bool] = []
-        for a, values in enumerate(of.levels.values):
-            levels: Array = np.zeros(0) if values is None else values  # those without levels do not move
-            same = self._next.same(a, levels, self._u[a])
-            self._own.append(np.sort(np.append(levels[~same], self._u[a])))
+        for a, values in enumerate(levels.values):
+            own: Array = np.zeros(0) if values is None else values  # those without levels do not move
+            same = self._next.same(a, own, self._u[a])
+            self._own.append(np.sort(np.append(own[~same], self._u[a])))
             self._is_level.append(bool(same.any()))
         self._values = [self._values_after(p) for p in range(len(factor.moves))]
 

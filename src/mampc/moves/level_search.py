@@ -168,7 +168,10 @@ class LevelSearch:
         """
         if completed is None and self._last_first:
             factor = self._of_values(pattern & self.admissible.open(allowance))
-            ends = LastFirst(self, sample, factor, allowance, past, priced, paid, cutoff)
+            ends = LastFirst(
+                self.condensed, self.admissible, self.levels,
+                sample, factor, allowance, past, priced, paid, cutoff,
+            )  # fmt: skip
             found = ends.run(deadline, most, lambda moves: self._keeps_limits(sample, moves))
             if found is not None:
                 return found
