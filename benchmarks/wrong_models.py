@@ -1,6 +1,6 @@
 """What a wrong model costs with a load bank, beside a Kalman filter at the same price.
 
-    python benchmarks/wrong_models.py [--plants 24] [--share 1.0]
+    python benchmarks/wrong_models.py [--plants 24] [--share 1.0] [--gain 1.0] [--kind integrator]
 
 Random plants (lags, dead times, integrators, resonances, modes that grow, two by two), whose gains, times, frequencies
 and dead times are `share` times 20 to 30 % off the model, follow two changes of reference under each kind of load.
@@ -12,6 +12,7 @@ without loads, in standard deviations of the noise, its median over plants and o
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy import signal
@@ -100,13 +101,16 @@ def loads(kind: str, size: float, period: float) -> list[object]:
     }[kind]
 
 
-def costs(seed: int, share: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def costs(
+    seed: int, share: float, gain: float, kinds: tuple[str, ...]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Errors and moves of each estimator, a row for every load, the filter's under an empty name; and offsets.
 
     These are what stays without loads, of each estimator and output, shape (estimators, l), in deviations of the noise.
     """
     rng = np.random.default_rng(FIRST_SEED + seed)
-    model, plant = pair(KINDS[seed % len(KINDS)], rng, share)
+    model, plant = pair(kinds[seed % len(kinds)], rng, share)
+    plant = replace(plant, B=gain * plant.B, D=gain * plant.D)
     m, l = model.n_inputs, model.n_outputs
     change = 0.35 * np.abs(model.step_response(31)).max(axis=0).sum(axis=1)
     noise = change * 10 ** rng.uniform(-2.3, -1)
@@ -147,8 +151,13 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--plants", type=int, default=3 * len(KINDS), help="how many")
     parser.add_argument("--share", type=float, default=1.0, help="of 20 to 30 %% that models are off")
+    parser.add_argument("--gain", type=float, default=1.0, help="of all inputs beside that")
+    parser.add_argument("--kind", choices=KINDS, help="of the plants; default all in turn")
     given = parser.parse_args()
-    made, stays = zip(*(costs(seed, given.share) for seed in range(given.plants)), strict=True)
+    kinds = KINDS if given.kind is None else (given.kind,)
+    made, stays = zip(
+        *(costs(seed, given.share, given.gain, kinds) for seed in range(given.plants)), strict=True
+    )
     offsets = np.quantile(np.hstack(stays), (0.5, 0.9), axis=1).T
     print("{:.2f} and {:.2f} deviations stay with the filter".format(*offsets[0]))
     filtered = np.concatenate([each[""] for each in made])

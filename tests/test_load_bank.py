@@ -11,7 +11,7 @@ from builders import identified_tank, random_model, tank_problem
 from load_bank_models import MODELS, bank_of
 from mampc import LoadBank, LoadKind
 from mampc.loop.disturbances import state_sizes
-from mampc.loop.doubt import FADED, LATE, grows, moves_of_late, runs_away
+from mampc.loop.doubt import FADED, LATE, moves_of_late, remembers, runs_away
 from mampc.loop.hypotheses import HYPOTHESES, INPUT_NOISE, Loads, Member
 from mampc.loop.mixing import FORGETS, JUMP_GOES_ON, LEAST, NOISE_REMEMBERED, STAYS, TO_JUMP, UNUSUAL
 from mampc.systems.riccati import predicted_covariance, seen_covariance
@@ -109,7 +109,7 @@ def naive(bank, estimate, drive, surplus, h):
         S = member.C @ member.covariance @ member.C.T + member.noise
         moved = sum(h[i] ** 2 * np.linalg.inv(S)[i, i] for i in range(len(e)))
         doubted = 1 + moved / len(e) / min(variance, 1.0)
-        corrected = 1.0 if grows(bank.model) else doubted
+        corrected = 1.0 if remembers(bank.model) else doubted
         members.append(z + member.covariance @ member.C.T @ np.linalg.solve(S, e) / corrected)
         surprise.append(e @ np.linalg.solve(S, e) / doubted)
         likelihood.append(

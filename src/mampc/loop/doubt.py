@@ -28,7 +28,7 @@ def moves_of_late(model: StateSpace) -> Array:
     done = model.step_response(n + faded + 2)[1:, :, :m]
     answers = np.abs(done) > NEGLIGIBLE * np.abs(done[: n + 1]).max(axis=0)
     dead = answers.argmax(axis=0)
-    if runs_away(model) and not grows(model):
+    if runs_away(model) and np.abs(model.poles()).max() <= 1 + INTEGRATES:
         done[:] = dead[:] = 0
     count = int(dead.max(initial=0)) + faded
     since = np.arange(1, count + 1)[:, None, None] - dead
@@ -39,14 +39,25 @@ def moves_of_late(model: StateSpace) -> Array:
     return np.vstack([counts.transpose(1, 0, 2).reshape(l, -1) @ moves, moves, u])
 
 
-def grows(model: StateSpace) -> bool:
-    """Whether a mode grows by itself, other than integrators."""
-    return bool(np.abs(model.poles()).max(initial=0.0) > 1 + INTEGRATES)
+def remembers(model: StateSpace) -> bool:
+    """Whether outputs do not come back after a pulse at some input: modes that integrate or grow.
+
+    What an estimate of these missed does not fade by itself.
+    """
+    return _lasts(model, 0.5)
+
+
+def runs_away(model: StateSpace) -> bool:
+    """Whether outputs go ever faster after a pulse at some input: modes that grow, or integrators in a row."""
+    return _lasts(model, 1.5)
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def runs_away(model: StateSpace) -> bool:
-    """Whether outputs go ever faster after a pulse at some input: modes that grow, or integrators in a row."""
+def _lasts(model: StateSpace, share: float) -> bool:
+    """Whether twice as long after a pulse at an input an output is more than a share of where it was before.
+
+    That is 1 for an integrator, 2 for two in a row, and next to nothing for lags.
+    """
     pulse = model.B[:, : model.n_inputs]
     pulses = np.diff(model.step_response(model.n_states + 2)[:, :, : model.n_inputs], axis=0)
     early = np.abs(pulses).max(axis=0)
@@ -57,6 +68,6 @@ def runs_away(model: StateSpace) -> bool:
     slowest = sizes[sizes < 1 - INTEGRATES].max(initial=0.0)
     power = np.linalg.matrix_power(model.A, max(LONG, int(SETTLED / (1 - slowest))))
     once, twice = np.abs(model.C @ power @ pulse), np.abs(model.C @ power @ power @ pulse)
-    # Twice as long after a pulse, two integrators are twice as fast. What is left of other modes may be rounding.
-    slower = (twice <= 1.5 * np.maximum(once, 1e-6 * size)) & np.isfinite(twice)
+    # What is left of other modes may be rounding.
+    slower = (twice <= share * np.maximum(once, 1e-6 * size)) & np.isfinite(twice)
     return not slower.all()

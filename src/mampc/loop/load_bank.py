@@ -11,8 +11,8 @@ tell: loads are told in units of the noise, so noise that was told wrongly chang
 
 A plant may do what inputs ask for later, or more or less of it, than its model says. By what the inputs' moves of the
 last samples did to the outputs, dead times aside, h, their innovations may be off: these vary by 1 / t_b = 1 + h'
-diag(S_b^-1) h / l times as much, and what is corrected falls by as much (but where modes of the plant grow, and errors
-would with them). Meanwhile plans count on the bank with the weight t = sum_b mu_b t_b, and for the rest on the plain
+diag(S_b^-1) h / l times as much, and what is corrected falls by as much (but where modes integrate or grow, and errors
+would not fade). Meanwhile plans count on the bank with the weight t = sum_b mu_b t_b, and for the rest on the plain
 filter that a regulator would have without a bank: that one follows slowly, and in one way whatever happens, so that a
 wrong model costs little more with a bank than without. The factor of the noise counts up to one here: errors of the
 model, which make it larger, are no reason for less caution. Where the noise was guessed it counts as the least it can
@@ -31,7 +31,7 @@ import numpy as np
 from mampc.base.checks import Array, BoolArray, as_flag, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
-from mampc.loop.doubt import grows, moves_of_late
+from mampc.loop.doubt import moves_of_late, remembers
 from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
@@ -113,7 +113,7 @@ class LoadBank(Estimator):
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
         self._of_late, self._moved = moves_of_late(model), slice(l)
-        self._grows = grows(model)
+        self._remembers = remembers(model)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         # The members' models differ in how s goes on: all may have the same A once their mixed z are multiplied by
         # `_begins` before, and by `_goes_on` after.
@@ -330,8 +330,8 @@ class LoadBank(Estimator):
         return self._estimate(correction, weights, usual, scale, late, plain, weights.dot(trust))
 
     def _damped(self, trust: Array) -> Array:
-        """By what hypotheses correct less: not at all where a mode grows, as their errors would."""
-        return np.ones_like(trust) if self._grows else trust
+        """By what hypotheses correct less: not at all where a mode integrates or grows, and errors stay."""
+        return np.ones_like(trust) if self._remembers else trust
 
     def _counts(self, weights: Array, late: Array, scale: Array) -> float:
         """t of the bank, with every output believed."""
