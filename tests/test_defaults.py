@@ -258,6 +258,23 @@ TALL = mampc.StateSpace.from_first_order(
 )
 
 
+def test_on_an_integrator_behind_a_lag_with_twice_the_gain_the_loop_with_a_bank_does_not_swing():
+    """Cost: squared errors and prices; a bank that corrects less after moves pays nine times the filter's."""
+    model, plant = (second_order(gain, 5.0, 0.0, INTEGRATOR) for gain in (0.1, 0.2))
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=30, control_horizon=3, move_weight=0.02,
+        limits=mampc.Limits(u_min=-1.0, u_max=1.0),
+    )  # fmt: skip
+    cost = []
+    for estimator in (LoadBank(model, noise=0.02), KalmanFilter.offset_free(model, measurement_noise=0.02)):
+        batch = mampc.simulate_batch(
+            plant, mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator),
+            mampc.steps(160, [0.0], [(5, [0.5])]), noise=0.02, seeds=range(3), progress=False,
+        )  # fmt: skip
+        cost.append(np.square(batch.y - batch.r).sum() + 0.1 * np.count_nonzero(np.diff(batch.u, axis=1)))
+    assert cost[0] < 2.0 * cost[1]
+
+
 @pytest.mark.parametrize("guessed", [False, True])
 def test_where_a_mode_grows_and_answers_come_late_the_bank_costs_no_more_than_the_filter(guessed):
     """Gain and dead time are off; a bank without doubt costs 8 times the filter where it is told the noise."""
