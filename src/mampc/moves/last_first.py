@@ -15,7 +15,7 @@ Values are counted from the present inputs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from math import prod
 from time import perf_counter
@@ -171,7 +171,8 @@ class LastFirst:
         None where moves do not keep limits of outputs, of which ends say too little: the first ones or the best ones.
         """
         root, visited = self._root(), 0
-        self._finish(root._replace(cost=root.cost + np.square(root.rest).sum(axis=2)))  # without moves
+        if self._may_stay([None] * self._m):
+            self._finish(root._replace(cost=root.cost + np.square(root.rest).sum(axis=2)))  # without moves
         pending = [(len(self._factor.moves) - 1, root.take(root.bound < self._cutoff))]
         self._look_ahead(pending[0][1])
         if self._best is not None and not keeps(self._best):
@@ -207,18 +208,18 @@ class LastFirst:
         self._finish(nodes)
 
     def _root(self) -> _Ends:
-        m, moves, keeps = self._m, self._factor.moves, True
-        for a in range(m):  # an input stays until its first move
-            own = moves[self._factor.own[a]]
-            keeps &= bool(
-                self._next.within(a, 0, int(own[0]) // m if len(own) else None, self._u[a : a + 1]).all()
-            )
+        m, moves = self._m, self._factor.moves
+        first = [int(moves[own[0]]) // m if len(own) else None for own in self._factor.own]
         base = self._base[None].copy()
         root = _Ends(
             np.zeros((1, len(moves))), np.zeros((1, m)), np.full((1, m), LATER), self._y[None].copy(), base,
             np.full(1, self._charge), np.zeros(1, dtype=np.intp), base.max(axis=1) + self._charge,
         )  # fmt: skip
-        return root.take(slice(int(keeps)))
+        return root.take(slice(int(self._may_stay(first))))
+
+    def _may_stay(self, until: Sequence[int | None]) -> bool:
+        """Whether inputs may be where they are before these samples, None for all."""
+        return all(self._next.within(a, 0, end, self._u[a : a + 1]).all() for a, end in enumerate(until))
 
     def _children(self, p: int, nodes: _Ends, nearest: int | None = None) -> tuple[_Ends, _Ends | None]:
         """What nodes lead to by one value, as far as it may beat the best plan, and the nodes that have to wait."""

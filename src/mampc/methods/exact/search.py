@@ -160,7 +160,7 @@ class ExactSearch:
     def _search_levels(
         self, patterns: BoolArray, sample: Sample, past: Allowance, solver: PatternSolver
     ) -> Plan:
-        """All courses of inputs on levels, in the order of time, beside each pattern of the others."""
+        """All courses of inputs on levels beside each pattern of the others."""
         best, deadline, limits, open_bound = Incumbent(), self._deadline(), None, np.inf
         if self.condensed.bounds.zones is not None or sample.margins.min(initial=np.inf) < 0:
             plain = self.condensed.plain.solve(sample.moves, sample.lower, sample.upper)
