@@ -336,6 +336,16 @@ def test_records_are_identified_from_a_least_length_on(m, l, weighting):
             assert np.isfinite(n4sid(data, weighting=weighting).model.A).all()
 
 
+@pytest.mark.parametrize(("count", "samples"), [(40, 15), (30, 11), (60, 20)])
+def test_many_short_records_give_a_model(count, samples):
+    """As exports with many gaps have them; each is shorter than the longest past that is looked at."""
+    rng, records, plant = np.random.default_rng(0), [], StateSpace([[0.8]], [[1.0]], [[1.0]], None, 1.0)
+    for _ in range(count):
+        u = rng.choice([-1.0, 1.0], (samples, 1))
+        records.append(IOData(u, plant.response(u) + 0.01 * rng.standard_normal((samples, 1)), 1.0))
+    assert n4sid(records).model.dc_gain() == pytest.approx(5.0, rel=0.05)
+
+
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
 @pytest.mark.parametrize("constant", ["u1", "u2", "y1", "y2"])
 def test_a_constant_signal_is_refused_by_name(constant, weighting):

@@ -212,9 +212,10 @@ def block_rows_for(samples: list[int], m: int, l: int, order: int | None, block_
         as_whole("order", order, 1)
     least = 2 if order is None else -(-order // l) + 1
 
-    # 2 s (m + l) Hankel rows want at least as many columns, N - 2 s + 1 of each record.
+    # 2 s (m + l) Hankel rows want at least as many columns, N - 2 s + 1 of each record. One goes for its constant, of a
+    # single record too, but there is room for that.
     def fits(s: int) -> bool:
-        return 2 * s * (m + l) <= sum(max(0, N - 2 * s + 1) for N in samples)
+        return 2 * s * (m + l) <= sum(max(0, N - 2 * s) for N in samples) + 1
 
     most = bisect_left(range(1, max(samples) + 1), True, key=lambda s: not fits(s))
     total = sum(samples)

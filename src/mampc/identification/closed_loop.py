@@ -146,8 +146,9 @@ def _dynamics(records: Scaled, feedthrough: bool, order: int | None) -> tuple[Ar
 
 
 def _lags(records: Scaled) -> int:
-    m, l = records.u[0].shape[1], records.y[0].shape[1]
-    return int(max(2, min(PAST, records.samples // (10 * (m + l)))))
+    """Coefficients of every signal, so few that some record is longer than twice as many samples."""
+    m, l, longest = records.u[0].shape[1], records.y[0].shape[1], max(map(len, records.u))
+    return int(max(2, min(PAST, records.samples // (10 * (m + l)), (longest - 2) // 2)))
 
 
 def _predictors(records: Scaled, lags: int, *, feedthrough: bool) -> tuple[Array, Array]:
