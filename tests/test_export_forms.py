@@ -345,8 +345,9 @@ def test_texts_in_other_encodings(tmp_path):
     names = {"inputs": "弁開度", "outputs": "温度"}
     with pytest.raises(MampcError, match=r"unless its encoding is passed \(--encoding\)"):
         read_export(path, **names)
-    with pytest.raises(MampcError, match="encoding: expected one such as 'cp932', received 'nonsense'"):
-        read_export(path, **names, encoding="nonsense")
+    for word in ("nonsense", "hex", "\0"):
+        with pytest.raises(MampcError, match="encoding: expected one such as 'cp932', received"):
+            read_export(path, **names, encoding=word)
     assert_whole(read_export(path, **names, encoding="cp932"))
 
 

@@ -116,7 +116,7 @@ def from_stamps(
     choice = min(strays, key=lambda key: strays[key], default="")
     words = f"times such as {example!r} in column {name!r}"
     if len(likely) == 1:
-        for other in orders.keys() - likely.keys():
+        for other in [key for key in orders if key not in likely]:
             ticks = orders[other].ticks()
             ticks = np.where(ticks == NEVER, likely[choice], ticks)
             if unevenness(since_first(ticks, in_utc, how, sheet, trial)[0]) < strays[choice] / 2:

@@ -96,8 +96,9 @@ def encoding_of(path: str | Path, content: bytes, named: str | None, findings: F
     """The encoding of a text, as it is named or as its bytes show it; raises `MampcError` where it is no text."""
     if named is not None:
         try:
+            "".encode(named)  # Python knows others, such as "hex", that are of no text
             return codecs.lookup(named).name
-        except (LookupError, TypeError):
+        except (LookupError, TypeError, ValueError):
             raise MampcError(f"encoding: expected one such as 'cp932', received {shown(named)}") from None
     if content[:4] in (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE):
         return "utf-32"
