@@ -113,7 +113,8 @@ class PatternTree:
             return None
         without = terms.at_root(problem.allowance.left)
         terms.add(found)
-        close = terms.at_root(problem.allowance.left) - without >= worth * (problem.cutoff - without)
+        closed = terms.at_root(problem.allowance.left) - without
+        close = not worth or closed >= worth * (problem.cutoff - without)
         if not close:
             terms.drop_latest()
         pattern = problem.moving(found.moves)
