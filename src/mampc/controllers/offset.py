@@ -151,8 +151,8 @@ def largest_saving(condensed: CondensedQP, change: Array) -> float:
 def highest_price(problem: TrackingProblem, changes: Array) -> float:
     """A price that pays after every change of the reference, rows of (k, l), to two digits.
 
-    It leaves at most half of a change for good where `largest_offset` promises anything. `mampc.tune` finds prices by
-    simulation instead.
+    It leaves at most half of a change for good where `largest_offset` promises anything; plans that count on later data
+    may leave more. `mampc.tune` finds prices by simulation instead.
     """
     price = HIGHEST_PRICE * min(largest_saving(CondensedQP(problem), change) for change in changes)
     price /= problem.model.n_inputs

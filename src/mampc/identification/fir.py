@@ -138,9 +138,8 @@ def _likeliest(gram: Array, product: Array, power: float, count: int, m: int) ->
         spread, slope = spreads(np.exp(theta[1 : 1 + m]), np.exp(theta[1 + m :]))
         d = spread.ravel()
         M = d[:, None] * gram * d
-        M[np.diag_indices(n)] += (
-            noise + 4 * n * np.finfo(float).eps * np.diag(M).max()
-        )  # as much as rounding takes
+        # Rounding may take as much.
+        M[np.diag_indices(n)] += noise + 4 * n * np.finfo(float).eps * np.diag(M).max()
         factor = np.linalg.cholesky(M)
         return factor, cho_solve((factor, True), d * product), d, slope, noise
 

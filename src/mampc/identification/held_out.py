@@ -85,9 +85,8 @@ def errors(parts: Sequence[Part], records: Scaled, cuts: Sequence[int]) -> Error
         independent[picked] = [
             independent_samples([one[:, i : i + 1] for one in left]) for i in range(len(picked))
         ]
-        size, ahead, root = _unpredicted(
-            [one[len(one) // 2 :] for one in whole]
-        )  # where no start shows any more
+        # The start of a record no longer shows in its second half.
+        size, ahead, root = _unpredicted([one[len(one) // 2 :] for one in whole])
         moves = (root > ROOT) & (size > ahead + RIVAL) | (size > ahead + SLOW)
         slow |= bool((moves & (size > np.log(LITTLE))).any())
     return Errors(float(np.mean(logs)), slow, level, independent)

@@ -21,10 +21,8 @@ from mampc.loop.load_bank import LoadBank
 from mampc.methods.alternating import Alternating
 from mampc.methods.exact.search import Exact
 
-FEW, FEW_SIZED = (
-    15,
-    12,
-)  # planned moves, up to which all patterns are listed beside later data; with least sizes
+FEW = 15  # planned moves, up to which all patterns are listed beside later data
+FEW_SIZED = 12  # of them with least sizes
 
 
 def has_scarce_moves(controller: Controller) -> bool:

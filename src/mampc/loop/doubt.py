@@ -27,7 +27,7 @@ def moves_of_late(model: StateSpace) -> Array:
     faded = int(np.ceil(-LATE * np.log(FADED)))
     done = model.step_response(n + faded + 2)[1:, :, :m]
     answers = np.abs(done) > NEGLIGIBLE * np.abs(done[: n + 1]).max(axis=0)
-    dead = answers.argmax(axis=0)
+    dead = answers[: n + 1].argmax(axis=0)  # what does nothing for n samples never does, but for rounding
     if runs_away(model) and np.abs(model.poles()).max() <= 1 + INTEGRATES:
         done[:] = dead[:] = 0
     count = int(dead.max(initial=0)) + faded

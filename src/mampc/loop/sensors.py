@@ -37,9 +37,7 @@ JUMP_OF_REACH = (
     0.1  # default largest jump, as a share of the reach: what the inputs' whole range does to an output
 )
 JUMP_OF_NOISE = 6.0  # and at least so many standard deviations of the noise, where it is known
-JUMP_OF_SURPRISE = (
-    7.5  # and so many times the usual surprise: 6 standard deviations, whose mean size is 0.8 of one
-)
+JUMP_OF_SURPRISE = 7.5  # and so many times the usual surprise: six standard deviations of white noise
 SURPRISE_FORGOTTEN = 0.05  # share of the usual surprise that each sample replaces
 SMALL_SURPRISE = 0.25  # of the largest jump: below it a surprise says nothing of the largest jump
 REACH_WITHIN = 10  # samples within which the inputs reach an output that washes out before its steady state

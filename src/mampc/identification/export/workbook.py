@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable, Iterator
 from datetime import date, datetime, time
 from functools import partial
 from pathlib import Path
@@ -12,16 +11,15 @@ from typing import Any
 
 from mampc.base.errors import MampcError, shown
 from mampc.identification.export.findings import Findings
-from mampc.identification.export.header import HIDDEN, Row
+from mampc.identification.export.header import HIDDEN
+from mampc.identification.export.text import Rows
 
 UNPACKED_LIMIT = 2**30  # bytes
 CELL_LIMIT = 50_000_000
 INSTALL = "pip install 'mampc[data]'"
 
 
-def read_workbook(
-    path: Any, content: bytes, findings: Findings
-) -> list[tuple[str, Callable[[], Iterator[list[Row]]]]]:
+def read_workbook(path: Any, content: bytes, findings: Findings) -> list[tuple[str, Rows]]:
     """The worksheets of an .xlsx file that are not hidden: title, and a function that yields all rows in one block.
 
     Raises:
@@ -42,21 +40,11 @@ def read_workbook(
         if len(visible) < len(book.worksheets):
             hidden = [sheet.title for sheet in book.worksheets if sheet.sheet_state != "visible"]
             findings.note(f"{HIDDEN}: {shown(hidden)}")
-        return [
-            (
-                sheet.title,
-                partial(
-                    iter,
-                    [
-                        [
-                            (n, list(map(_word, row)))
-                            for n, row in enumerate(sheet.iter_rows(values_only=True), 1)
-                        ]
-                    ],
-                ),
-            )
-            for sheet in visible
-        ]
+        found: list[tuple[str, Rows]] = []
+        for sheet in visible:
+            cells = enumerate(sheet.iter_rows(values_only=True), 1)
+            found.append((sheet.title, partial(iter, [[(n, list(map(_word, row))) for n, row in cells]])))
+        return found
     except MampcError:
         raise
     except Exception as error:  # whatever a damaged file makes of the libraries that unpack it

@@ -82,9 +82,7 @@ class Branching:
         self._zones = ZoneCurvature(squares.condensed, squares.normal, order, sample) if zoned else None
         self._tried: set[bytes] = set()
         self._made = 0  # nodes
-        self._out_of_time = (
-            False  # whether the last nodes' programs, or a plan that they show, had no time left
-        )
+        self._out_of_time = False  # for the last nodes' programs, or for a plan that they show
 
     def run(self, root: Multipliers | None = None) -> float:
         """A lower bound over everything that was not visited: infinite when the search is complete.
