@@ -1,6 +1,7 @@
 """Inputs on levels that are fine beside the price of a move are searched by patterns, others by courses."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -140,3 +141,27 @@ def test_coarse_levels_are_searched_by_courses():
     for levels, price, by_table in ((mampc.OnOff(), 0.1, False), (1e-4, 0.1, True), (1e-4, 0.0, False)):
         controller = mampc.MAMPC(problem, mampc.MoveRules(levels=levels, price=price))
         assert controller._search.has_table is by_table
+
+
+@pytest.mark.parametrize("price", [0.0, 0.5])
+def test_an_input_does_not_stay_where_a_later_limit_forbids_it(price):
+    """Beside all courses one by one: in steady state to stay costs nothing, and breaks a limit two samples ahead."""
+    model = mampc.StateSpace.from_first_order(gain=2.0, time_constant=50.0, dead_time=0.0, dt=10.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=10, control_horizon=4, limits=mampc.Limits(u_min=1.0, u_max=5.0)
+    )
+    rules, past = mampc.MoveRules(levels=1.0, price=price), np.array([[3.0]])
+    x = model.steady_state(past[0])
+    reference, highest = model.y_op + model.C @ x, np.array([[5.0], [5.0], [2.0], [2.0]])
+    controller = mampc.MAMPC(problem, rules)
+    decision = controller.step(
+        controller.initial_state(past), x, reference, limits=mampc.Limits(u_max=highest)
+    )
+    least = min(
+        objective_of(problem, rules, x, past, reference, np.array(course)[:, None])
+        for course in product(range(1, 6), repeat=4)
+        if (np.array(course) <= highest[:, 0]).all()
+    )
+    assert decision.status is Status.OPTIMAL
+    assert (decision.plan <= highest).all()
+    assert decision.objective == pytest.approx(least, rel=1e-9)
