@@ -14,9 +14,10 @@ from mampc import StateSpace
 from mampc.cli import app
 from mampc.program.condensing import CondensedQP
 from mampc.study import load_study, parse_study, template
+from mampc.study.cautions import cautions
 from mampc.study.draft import draft
 from mampc.study.own import own_study
-from mampc.study.regulators import regulator_of
+from mampc.study.regulators import problem_of, regulator_of
 from mampc.study.running import run_study
 from mampc.systems.evidence import Evidence
 from mampc.systems.noise import Noise
@@ -252,6 +253,19 @@ def test_a_price_that_can_never_pay_is_told_and_is_one(tmp_path):
         text = text.replace(f"price = {price}", f"price = {factor * saves}")
         run = run_study(parse_study(text, folder=tmp_path)).runs["noise-free"]["price"]
         assert (np.ptp(run.u) > 0) == moves
+
+
+@pytest.mark.parametrize(("offset", "told"), [(0.59, False), (0.61, True)])
+def test_an_offset_as_large_as_every_change_is_told_as_plans_of_the_regulator_leave_it(
+    tmp_path, offset, told
+):
+    study, _ = warned(tmp_path)
+    problem, reference = problem_of(study, StateSpace.load(tmp_path / "model.json")), np.array([[0.0], [0.6]])
+    offsets = {
+        table.name: np.array([offset if table.name == "price" else 0.0]) for table in study.controllers
+    }
+    found = cautions(study, problem, reference, offsets)
+    assert [("'price' may leave every change" in one) for one in found] == [True] * told
 
 
 def test_a_reference_out_of_reach_and_changes_too_late_are_told(tmp_path):

@@ -1,7 +1,8 @@
-"""What should be known of a study before its figures are trusted: seen from its problem and reference alone."""
+"""What should be known of a study before its figures are trusted: seen from its problem, reference and regulators."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -19,13 +20,16 @@ ROUNDING = 1e-6  # of the largest change, as outputs weigh: what an output that 
 MOST_LEVELS = 50  # different references that are looked at
 
 
-def cautions(study: Study, problem: TrackingProblem, reference: Array) -> tuple[str, ...]:
+def cautions(
+    study: Study, problem: TrackingProblem, reference: Array, offsets: Mapping[str, Array]
+) -> tuple[str, ...]:
     """A sentence each.
 
     Args:
         study: whose controllers have prices.
         problem: that all of them have.
         reference: shape (steps, l), in engineering units.
+        offsets: of each controller, `Regulator.largest_offset`.
     """
     # A zone is as good as a set point for what happens beyond it.
     condensed = CondensedQP(replace(problem, zone_below=0.0, zone_above=0.0))
@@ -34,7 +38,7 @@ def cautions(study: Study, problem: TrackingProblem, reference: Array) -> tuple[
         *_unstable(study, condensed),
         *_late(study),
         *_out_of_reach(condensed, levels, problem),
-        *_never_pays(study, condensed, levels),
+        *_never_pays(study, condensed, levels, offsets),
     )
 
 
@@ -91,7 +95,9 @@ def _out_of_reach(condensed: CondensedQP, levels: Array, zones: TrackingProblem)
     ]
 
 
-def _never_pays(study: Study, condensed: CondensedQP, levels: Array) -> list[str]:
+def _never_pays(
+    study: Study, condensed: CondensedQP, levels: Array, offsets: Mapping[str, Array]
+) -> list[str]:
     """Controllers with a price beyond what any change of the reference can save."""
     problem = condensed.problem
     changes = (levels[:, None] - levels[None]).reshape(-1, levels.shape[1])
@@ -108,7 +114,9 @@ def _never_pays(study: Study, condensed: CondensedQP, levels: Array) -> list[str
                 f"{saving:.3g}; lower the price, or raise output_weight or tail_horizon"
             )
             continue
-        offset = largest_offset(problem, rules)
+        offset = offsets[table.name]
+        if not np.isfinite(offset).all():  # zones and heuristics promise nothing, and leave no less
+            offset = largest_offset(problem, rules)
         if price > 0 and np.isfinite(offset).all() and (offset >= np.abs(changes).max(axis=0)).all():
             found.append(
                 f"{table.name!r} may leave every change of the reference as it is: at its price, offsets of up to "

@@ -117,8 +117,10 @@ def run_study(
             run = run_controller(study, prepared, scenario, regulators[table.name])
             runs[scenario.name][table.name] = run
             on_run(scenario.name, table.name, run)
-    warnings = cautions(study, problem_of(study, prepared.model), _reference(study, prepared)) + _faults(runs)
     made = {name: Made.of(regulator) for name, regulator in regulators.items()}
+    offsets = {name: one.largest_offset for name, one in made.items()}
+    problem, reference = problem_of(study, prepared.model), _reference(study, prepared)
+    warnings = cautions(study, problem, reference, offsets) + _faults(runs)
     return StudyResult(study, prepared.model, prepared.data, prepared.identified, runs, warnings, made)
 
 
