@@ -152,9 +152,20 @@ def test_plans_that_count_on_later_data_move_less_beside_a_delay_that_the_model_
     assert error[1] < 1.1 * error[0]
 
 
+def cost_over_the_filters(plant, problem, reference, *, price, noise, guessed=False, **surroundings):
+    """Squared errors and prices of loops with a bank, over those of loops with the filter."""
+    bank = LoadBank.for_problem(problem) if guessed else LoadBank(problem.model, noise=noise)
+    cost = []
+    for estimator in (bank, KalmanFilter.offset_free(problem.model, measurement_noise=noise)):
+        regulator = mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=price)), estimator)
+        batch = mampc.simulate_batch(plant, regulator, reference, noise=noise, progress=False, **surroundings)
+        cost.append(np.square(batch.y - batch.r).sum() + price * np.count_nonzero(np.diff(batch.u, axis=1)))
+    return cost[0] / cost[1]
+
+
 @pytest.mark.parametrize("delay", [6.0, 10.0])
 def test_with_longer_delays_missing_the_bank_does_better_than_the_filter(delay):
-    """Of 0.3 and 0.5 of the time constant; cost: squared errors, and a tenth for each move."""
+    """Of 0.3 and 0.5 of the time constant."""
     model, plant = (
         mampc.StateSpace.from_first_order(gain=[[2.0]], time_constant=[[20.0]], dead_time=[[late]], dt=1.0)
         for late in (0.0, delay)
@@ -163,20 +174,13 @@ def test_with_longer_delays_missing_the_bank_does_better_than_the_filter(delay):
         model, prediction_horizon=30, control_horizon=3, move_weight=0.1, tail_horizon=30.0,
         limits=mampc.Limits(u_min=-10.0, u_max=10.0),
     )  # fmt: skip
-    cost = []
-    for estimator in (LoadBank(model, noise=0.02), KalmanFilter.offset_free(model, measurement_noise=0.02)):
-        regulator = mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator)
-        run = mampc.simulate(
-            plant, regulator, mampc.steps(200, [0.0], [(5, [1.0])]), noise=0.02, seed=1, progress=False
-        )
-        moves = np.count_nonzero(np.diff(run.u, axis=0))
-        cost.append(((run.y - run.r) ** 2).sum() + 0.1 * moves)
-    assert cost[0] < 0.9 * cost[1]
+    reference = mampc.steps(200, [0.0], [(5, [1.0])])
+    assert cost_over_the_filters(plant, problem, reference, price=0.1, noise=0.02, seeds=[1]) < 0.9
 
 
 @pytest.mark.parametrize("inputs", [1, 2])
 def test_with_dead_times_a_fifth_and_a_sample_off_the_bank_does_not_swing(inputs):
-    """Cost: squared errors, and a tenth for each move; one that forgets moves before they show pays ten times more."""
+    """A bank that forgets moves before they show costs ten times more."""
     gain, lag, dead = [[1.0]], [[6.0]], [[8.0]]
     if inputs == 2:
         gain, lag, dead = [[1.0, 0.6], [-0.5, 1.0]], [[6.0, 10.0], [8.0, 5.0]], [[6.0, 3.0], [2.0, 7.0]]
@@ -191,22 +195,8 @@ def test_with_dead_times_a_fifth_and_a_sample_off_the_bank_does_not_swing(inputs
         model, prediction_horizon=30, control_horizon=3, move_weight=0.05,
         limits=mampc.Limits(u_min=-5 * np.ones(inputs), u_max=5 * np.ones(inputs)),
     )  # fmt: skip
-    controller, reference = (
-        mampc.MAMPC(problem, MoveRules(price=0.1)),
-        mampc.steps(160, np.zeros(inputs), [(5, np.ones(inputs))]),
-    )
-    cost = []
-    for estimator in (LoadBank(model, noise=0.02), KalmanFilter.offset_free(model, measurement_noise=0.02)):
-        batch = mampc.simulate_batch(
-            plant,
-            mampc.Regulator(controller, estimator),
-            reference,
-            noise=0.02,
-            seeds=range(3),
-            progress=False,
-        )
-        cost.append(np.square(batch.y - reference).sum() + 0.1 * np.count_nonzero(np.diff(batch.u, axis=1)))
-    assert cost[0] < 1.5 * cost[1]
+    reference = mampc.steps(160, np.zeros(inputs), [(5, np.ones(inputs))])
+    assert cost_over_the_filters(plant, problem, reference, price=0.1, noise=0.02, seeds=range(3)) < 1.5
 
 
 RESONANT, INTEGRATOR = (0.0, 1.0), (1.0, 0.0)
@@ -223,24 +213,18 @@ def second_order(gain, time, damping, kind):
 @pytest.mark.parametrize("guessed", [False, True])
 @pytest.mark.parametrize("kind", [RESONANT, INTEGRATOR], ids=["resonant", "integrator and lag"])
 def test_with_a_wrong_model_the_bank_costs_little_more_than_the_filter(kind, guessed):
-    """Gain and time are a quarter off, noise is small beside what inputs do; cost: squared errors and prices."""
+    """Gain and time are a quarter off, noise is small beside what inputs do."""
     model = second_order(1.0, 4.0, 0.1, kind)
     plant = second_order(1.25, 4.0 * 1.25 ** (-1 if kind is RESONANT else 1), 0.1, kind)
     problem = mampc.TrackingProblem(
         model, prediction_horizon=30, control_horizon=3, move_weight=0.02, tail_horizon=20.0,
         limits=mampc.Limits(u_min=-1.0, u_max=1.0),
     )  # fmt: skip
-    cost = []
-    bank = LoadBank.for_problem(problem) if guessed else LoadBank(model, noise=0.005)
-    for estimator in (bank, KalmanFilter.offset_free(model, measurement_noise=0.005)):
-        batch = mampc.simulate_batch(
-            plant, mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.02)), estimator),
-            mampc.steps(150, [0.0], [(10, [0.5])]), noise=0.005, seeds=range(2), progress=False,
-            loads=[mampc.loads.RandomSteps(size=0.2, every=60.0)],
-        )  # fmt: skip
-        moves = np.count_nonzero(np.diff(batch.u, axis=1))
-        cost.append(np.square(batch.y - batch.r).sum() + 0.02 * moves)
-    assert cost[0] < 1.4 * cost[1]
+    loads = [mampc.loads.RandomSteps(size=0.2, every=60.0)]
+    reference = mampc.steps(150, [0.0], [(10, [0.5])])
+    assert cost_over_the_filters(
+        plant, problem, reference, price=0.02, noise=0.005, guessed=guessed, seeds=range(2), loads=loads
+    ) < 1.4  # fmt: skip
 
 
 INVERSE = mampc.StateSpace(  # first the wrong way
@@ -259,20 +243,14 @@ TALL = mampc.StateSpace.from_first_order(
 
 
 def test_on_an_integrator_behind_a_lag_with_twice_the_gain_the_loop_with_a_bank_does_not_swing():
-    """Cost: squared errors and prices; a bank that corrects less after moves pays nine times the filter's."""
+    """A bank that corrects less after moves costs nine times the filter."""
     model, plant = (second_order(gain, 5.0, 0.0, INTEGRATOR) for gain in (0.1, 0.2))
     problem = mampc.TrackingProblem(
         model, prediction_horizon=30, control_horizon=3, move_weight=0.02,
         limits=mampc.Limits(u_min=-1.0, u_max=1.0),
     )  # fmt: skip
-    cost = []
-    for estimator in (LoadBank(model, noise=0.02), KalmanFilter.offset_free(model, measurement_noise=0.02)):
-        batch = mampc.simulate_batch(
-            plant, mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator),
-            mampc.steps(160, [0.0], [(5, [0.5])]), noise=0.02, seeds=range(3), progress=False,
-        )  # fmt: skip
-        cost.append(np.square(batch.y - batch.r).sum() + 0.1 * np.count_nonzero(np.diff(batch.u, axis=1)))
-    assert cost[0] < 2.0 * cost[1]
+    reference = mampc.steps(160, [0.0], [(5, [0.5])])
+    assert cost_over_the_filters(plant, problem, reference, price=0.1, noise=0.02, seeds=range(3)) < 2.0
 
 
 @pytest.mark.parametrize("guessed", [False, True])
@@ -283,15 +261,10 @@ def test_where_a_mode_grows_and_answers_come_late_the_bank_costs_no_more_than_th
         model, prediction_horizon=20, control_horizon=3, move_weight=0.02, tail_horizon=1.0,
         limits=mampc.Limits(u_min=-5.0, u_max=5.0),
     )  # fmt: skip
-    cost = []
-    bank = LoadBank.for_problem(problem) if guessed else LoadBank(model, noise=0.01)
-    for estimator in (bank, KalmanFilter.offset_free(model, measurement_noise=0.01)):
-        batch = mampc.simulate_batch(
-            later(real, 2), mampc.Regulator(mampc.MAMPC(problem, MoveRules(price=0.1)), estimator),
-            mampc.steps(160, [0.0], [(5, [0.5])]), noise=0.01, seeds=range(3), progress=False,
-        )  # fmt: skip
-        cost.append(np.square(batch.y - batch.r).sum() + 0.1 * np.count_nonzero(np.diff(batch.u, axis=1)))
-    assert cost[0] < 1.1 * cost[1]
+    reference = mampc.steps(160, [0.0], [(5, [0.5])])
+    assert cost_over_the_filters(
+        later(real, 2), problem, reference, price=0.1, noise=0.01, guessed=guessed, seeds=range(3)
+    ) < 1.1  # fmt: skip
 
 
 @pytest.mark.parametrize(
