@@ -35,7 +35,7 @@ from mampc.program.problem import TrackingProblem
 from mampc.program.tail import square_root
 
 HIGHEST_PRICE = 1 / 16  # of what moves save after a change: changes of a quarter of it are still worth them
-FEW = 15  # planned moves, up to which all patterns are looked at
+FEW = 15  # planned moves, up to which all patterns are listed beside later data
 LEFT = 0.5  # of a change of reference: the largest offset that a price may leave for good
 
 

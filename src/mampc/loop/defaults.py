@@ -14,6 +14,7 @@ import numpy as np
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.mampc import MAMPC
+from mampc.controllers.offset import FEW
 from mampc.loop.doubt import runs_away
 from mampc.loop.estimator import Estimator
 from mampc.loop.kalman_filter import KalmanFilter
@@ -21,8 +22,7 @@ from mampc.loop.load_bank import LoadBank
 from mampc.methods.alternating import Alternating
 from mampc.methods.exact.search import Exact
 
-FEW = 15  # planned moves, up to which all patterns are listed beside later data
-FEW_SIZED = 12  # of them with least sizes
+FEW_SIZED = 12  # planned moves with least sizes, up to which all patterns are soon searched
 
 
 def has_scarce_moves(controller: Controller) -> bool:

@@ -108,7 +108,10 @@ def compute(
     low, high = (r, r) if zone is None else (zone.low, zone.high)
     error = (np.maximum(y - high, 0.0) - np.maximum(low - y, 0.0))[skip:]
     off = np.abs(error)
-    Q = 1.0 if output_weight is None else as_weight("output_weight", output_weight, y.shape[1])
+    tracking_error = weighted_error = float(np.mean(np.sum(off**2, axis=1)))
+    if output_weight is not None:
+        Q = as_weight("output_weight", output_weight, y.shape[1])
+        weighted_error = float(np.mean(np.sum(error @ Q * error, axis=1)))
     in_zone = (high > low)[skip:]
     outside, has_zone = (off > 0) & in_zone, in_zone.any(axis=0)
     times = outside.sum(axis=0)
@@ -125,10 +128,8 @@ def compute(
         threshold=threshold,
         sparse_density=(size > threshold).sum(axis=0) / steps,
         exact_density=moves / steps,
-        tracking_error=(tracking_error := float(np.mean(np.sum(off**2, axis=1)))),
-        weighted_error=tracking_error
-        if output_weight is None
-        else float(np.mean(np.sum(error @ Q * error, axis=1))),
+        tracking_error=tracking_error,
+        weighted_error=weighted_error,
         time_outside=np.where(has_zone, times / np.maximum(in_zone.sum(axis=0), 1), np.nan),
         mean_distance_outside=np.where(has_zone, mean_distance, np.nan),
         moves=moves,

@@ -104,8 +104,8 @@ class PatternTree:
     def _relax_root(self, problem: SampleProblem, worth: float = 0.0) -> Multipliers | None:
         """Bound everything with limits and prices as a relaxed program has them, and try its moves.
 
-        They bound nothing where they close less than a share `worth` of the gap: each batch of nodes would take a
-        program more. None if they do.
+        Its multipliers; None where they close less than a share `worth` of the gap and are dropped again, since each
+        batch of nodes would take a program more, or where there are none.
         """
         domain, terms = problem.domain, problem.terms
         found = problem.relaxation.solve_priced(domain.low, domain.high, domain.up, domain.down)
