@@ -71,6 +71,7 @@ class AdmissiblePatterns:
         self.simple = rules.dwell == 1 and self.per_step == m and not self.simultaneous
         self._most = n_c if self.simultaneous else self.n_moves
         self._all_free = (0,) * m
+        self._price_of_moves = np.tile(self.price, n_c)
         self._same = SAME * input_prefix
 
     @property
@@ -115,8 +116,8 @@ class AdmissiblePatterns:
         """The moves of inputs that are not frozen, at the starts of blocks, shape (n_moves,)."""
         if not any(allowance.frozen):
             return self.candidates
-        j = np.arange(self.n_moves) // self.n_inputs
-        return self.candidates & (j >= np.tile(allowance.frozen, self.control_horizon))
+        moving = np.arange(self.control_horizon)[:, None] >= np.array(allowance.frozen)
+        return self.candidates & moving.ravel()
 
     def count(self, pattern: BoolArray) -> int:
         """How many moves a pattern, shape (n_moves,), holds, as budget and price count them."""
@@ -160,21 +161,21 @@ class AdmissiblePatterns:
 
         The best pattern under budgets, prices and limits per sample; a greedy choice where dwell times bind.
         """
-        m, builder = self.n_inputs, PatternBuilder(self, allowance)
-        worth = np.where(self.open(allowance), worth, 0.0)
+        m, worth = self.n_inputs, np.where(self.open(allowance), worth, 0.0)
         if self.simple:
-            rank = worth - np.tile(self.price, self.control_horizon)
+            rank = worth - self._price_of_moves
             pattern = np.zeros(self.n_moves, dtype=bool)
-            pattern[np.argsort(-rank, kind="stable")[: allowance.left]] = True
+            pattern[(-rank).argsort(kind="stable")[: allowance.left]] = True
             return pattern & (rank > 0)
+        builder = PatternBuilder(self, allowance)
         if self.simultaneous:
             by_sample = worth.reshape(-1, m)
             kept = by_sample if self.per_step == m else np.sort(by_sample, axis=1)[:, -self.per_step :]
             rank = np.repeat(kept.sum(axis=1), m)
             order = np.lexsort((-worth, np.arange(self.n_moves) // m, -rank))
         else:
-            rank = worth - np.tile(self.price, self.control_horizon)
-            order = np.argsort(-rank, kind="stable")
+            rank = worth - self._price_of_moves
+            order = (-rank).argsort(kind="stable")
         threshold = self.price[0] if self.simultaneous else 0.0
         for i in order.tolist():
             if builder.full or rank[i] <= threshold:
