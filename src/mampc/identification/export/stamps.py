@@ -44,6 +44,7 @@ MOST_FORMATS = 4  # in one column, such as with and without fractions of seconds
 PLAIN = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d{1,6})?)?", re.ASCII)
 DECIMAL = re.compile(r"(\d),(\d)")
 DIGIT, LETTER = re.compile(r"\d"), re.compile(r"[^\W\d_]")
+FIELD = re.compile(r"%.|\w|\s")
 NEVER = np.iinfo(np.int64).min  # among ticks, as numpy has it
 
 Ticks = npt.NDArray[np.int64]  # microseconds since 1970, in UTC or in local time
@@ -213,12 +214,20 @@ class _Order:
             kinds.setdefault(LETTER.sub("a", DIGIT.sub("0", cell)), []).append(cell)
         ends = (" %z", "%z", "") if utc else ("",)
         for kind in [kind for kind in kinds if kind not in self.strange]:
-            for cell, form, end in product((kinds[kind][0], kinds[kind][-1]), self.formats, ends):
+            formats = self.formats
+            if len(formats) > 1:  # those with the marks of the cell: pandas takes long to refuse each of the others
+                formats = [form for form in formats if _marks(kind).startswith(_marks(form))]
+            for cell, form, end in product((kinds[kind][0], kinds[kind][-1]), formats, ends):
                 if form + end not in self.fitting and _parsed(cell, form + end, utc) is not pd.NaT:
                     self.fitting.append(form + end)
                     return True
             self.strange.add(kind)
         return False
+
+
+def _marks(text: str) -> str:
+    """What stands between the digits and words of a stamp or the fields of a format, without spaces."""
+    return FIELD.sub("", text)
 
 
 def _parsed(words: Any, form: str, utc: bool) -> Any:
