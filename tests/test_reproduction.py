@@ -4,6 +4,7 @@ import re
 from itertools import islice
 
 import pytest
+from joblib import parallel_config
 
 from mampc.compare.sensitivity import Point, holding, sensitivity, varied
 from mampc.report import output, reproduction
@@ -16,13 +17,15 @@ from mampc.study.running import prepare, run_controller
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """The page of one case with a small grid."""
+    """The page of one short case with a small grid."""
     folder = tmp_path_factory.mktemp("page") / "out"
     patch = pytest.MonkeyPatch()
     patch.setattr(reproduction, "CASES", {"quadruple-tank": {"penalty": [1.0, 10.0], "noise": [0.1]}})
     patch.setattr(reproduction, "study_figures", lambda result: islice(study_figures(result), 2))
+    patch.setattr(reproduction, "load_study", lambda name: load_study(name).model_copy(update={"steps": 50}))
     patch.setattr(output, "FIGURE_KINDS", ("svg",))
-    cases = reproduction.reproduce(folder)
+    with parallel_config("sequential"):  # processes would take longer to start than the runs
+        cases = reproduction.reproduce(folder)
     patch.undo()
     return folder, cases
 
@@ -60,7 +63,7 @@ def test_judgements_follow_from_the_figures(written):
 
 def test_a_sensitivity_point_equals_the_runs_it_stands_for(written):
     _, cases = written
-    study = load_study("quadruple-tank")
+    study = cases[0].study
     prepared, scenario = prepare(study), study.scenarios[-1]
     plain, sparse = study.controllers[0], study.controllers[2]
     base, other = (
