@@ -78,7 +78,7 @@ def assert_legible(figure):
 COUNTS = [n if n in (1, 12) else pytest.param(n, marks=pytest.mark.slow) for n in range(1, 13)]
 
 
-@pytest.mark.parametrize("name", [LONG, "W" * 80, *deep("MPC")])
+@pytest.mark.parametrize("name", ["W" * 80, *deep("MPC", LONG)])
 @pytest.mark.parametrize("count", COUNTS)
 def test_all_names_are_inside_the_picture_and_apart(count, name):
     runs = named_runs(count, name)

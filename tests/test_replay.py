@@ -39,7 +39,7 @@ def tight_regulator(method):
 @pytest.mark.usefixtures("either_estimator")
 @pytest.mark.parametrize("method", CONTROLLERS)
 def test_a_state_kept_as_text_leads_to_the_same_decisions_to_the_bit(method):
-    regulator = tight_regulator(method)
+    regulator, elsewhere = tight_regulator(method), tight_regulator(method)
     state, rng = regulator.initial_state(), np.random.default_rng(0)
     model = regulator.controller.problem.model
     for k in range(examples(25, quick=8)):
@@ -47,7 +47,6 @@ def test_a_state_kept_as_text_leads_to_the_same_decisions_to_the_bit(method):
         reference = model.y_op + 4.0 * (k > 5)
         text = state.to_json()
         decision = regulator.step(state, y, reference)
-        elsewhere = tight_regulator(method)
         again = elsewhere.step(elsewhere.state_from_json(text), y, reference)
         assert again.state.to_json() == decision.state.to_json()
         assert same_decision(again, decision, atol=0)

@@ -150,6 +150,6 @@ def test_models_of_some_hundred_states_are_saved_loaded_and_controlled_with(tmp_
     model.save(tmp_path / "large.json")
     loaded = StateSpace.load(tmp_path / "large.json")
     assert np.array_equal(loaded.A, model.A)
-    problem = mampc.TrackingProblem(loaded, prediction_horizon=60, control_horizon=3)
+    problem = mampc.TrackingProblem(loaded, prediction_horizon=10, control_horizon=3)
     regulator = mampc.Regulator(mampc.MPC(problem))
     assert regulator.step(regulator.initial_state(), np.zeros(12), np.ones(12)).status.name == "OPTIMAL"

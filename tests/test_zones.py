@@ -22,8 +22,9 @@ from mampc.program.condensing import CondensedQP
 from mampc.program.least_distance import LeastDistance
 from referees import (
     assert_best_of_all_patterns,
-    best_on_every_pattern,
+    best_on,
     objective_of,
+    program_of,
     scip_bounds,
 )
 from seeds import examples
@@ -325,9 +326,8 @@ def test_small_move_weights_leave_the_optimum_what_it_is():
             problem, x, reference, _ = random_problem(seed, move_weight=weight)
             mpc = mampc.MPC(problem)
             decision = mpc.step(mpc.initial_state(), x, reference)
-            best = best_on_every_pattern(
-                replace(problem, control_horizon=3), PLAIN, x, problem.model.u_op, reference
-            )[-1]
+            program = program_of(problem, x, problem.model.u_op, reference)
+            best = best_on(program, np.ones(6, dtype=bool), len(program.f) - 6)
             cost = cost_of(problem, x, problem.model.u_op, reference, decision.plan)
             assert decision.objective == pytest.approx(cost, rel=1e-7, abs=1e-9)
             assert decision.objective <= best * (1 + 1e-6) + 1e-7

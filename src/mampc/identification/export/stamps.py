@@ -215,7 +215,9 @@ class _Order:
         ends = (" %z", "%z", "") if utc else ("",)
         for kind in [kind for kind in kinds if kind not in self.strange]:
             formats = self.formats
-            if len(formats) > 1:  # those with the marks of the cell: pandas takes long to refuse each of the others
+            if (
+                len(formats) > 1
+            ):  # those with the marks of the cell: pandas takes long to refuse each of the others
                 formats = [form for form in formats if _marks(kind).startswith(_marks(form))]
             for cell, form, end in product((kinds[kind][0], kinds[kind][-1]), formats, ends):
                 if form + end not in self.fitting and _parsed(cell, form + end, utc) is not pd.NaT:
