@@ -72,7 +72,7 @@ def test_slow_and_fast_channels_keep_their_states_under_coloured_noise():
     assert (error < 0.2 * np.abs(gain).max(axis=1)).all()
 
 
-@pytest.mark.parametrize("units", [UNITS[0], *deep(UNITS[1])])
+@pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("periods", [0.6, 2.0, *deep(0.9, 6.0)])
 @pytest.mark.parametrize("size", [20.0, *deep(2.0)])
 def test_a_slow_wave_does_not_change_the_gain(size, periods, units):

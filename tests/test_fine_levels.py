@@ -84,7 +84,9 @@ def test_courses_decided_from_either_end_have_the_same_optimum(seed, monkeypatch
         found.append(controller.step(controller.initial_state(past), x, reference, limits=limits))
     forward, *short, complete = found
     assert complete.status is forward.status
-    assert complete.objective == pytest.approx(forward.objective, rel=1e-9)
+    assert complete.objective == pytest.approx(forward.objective, rel=1e-9, nan_ok=True)
+    if not np.isfinite(forward.objective):  # no plan
+        return
     for decision in short:
         assert decision.lower_bound <= forward.objective * (1 + 1e-9)
         assert decision.objective >= forward.objective * (1 - 1e-9)

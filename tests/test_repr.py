@@ -36,6 +36,7 @@ def test_only_what_was_set_is_printed():
     assert repr(mampc.Limits(u_min=0.0, u_max=[1.0, 2.0])) == "Limits(u_min=0, u_max=[1., 2.])"
     assert repr(mampc.MoveRules(price=0.5)) == "MoveRules(price=0.5)"
     assert repr(mampc.Limits(u_min="low")) == "Limits(u_min='low')"
+    assert repr(mampc.Limits(u_max=np.ones((3, 2)))).startswith("Limits(u_max=[[1., 1.]")  # over the horizon
 
 
 def test_a_decision_is_equal_to_itself_alone():

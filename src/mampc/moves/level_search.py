@@ -280,8 +280,15 @@ class _OneSample:
         )  # fmt: skip
         if self._zones is not None:
             root.cost[:, 0] += self._zones.cost(root.d, self._sample, self._zones.last < 0)
+        if self._completed is None and not self._free_may_stay():
+            return root.take(slice(0))
         root = self._bounded(root)
         return self._with_few_more(0, root) if self._few else root
+
+    def _free_may_stay(self) -> bool:
+        """Whether limits let inputs without levels be where they are throughout."""
+        u, values = self._sample.u_previous, self._of.levels.values
+        return all(self._next.within(a, 0, None, u[a]).all() for a in range(self._m) if values[a] is None)
 
     def _bounded(self, nodes: Courses) -> Courses:
         own = nodes.cost[:, 0]

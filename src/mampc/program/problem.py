@@ -75,7 +75,7 @@ def _short(values: Any) -> str:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         return shown(values)  # not checked yet
-    if array.ndim == 2 and not (array - np.diag(np.diag(array))).any():
+    if array.ndim == 2 and array.shape[0] == array.shape[1] and not (array - np.diag(np.diag(array))).any():
         array = np.diag(array)
     if array.size and (array == array.flat[0]).all() and array.ndim < 2:
         return f"{array.flat[0]:g}"
