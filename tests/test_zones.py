@@ -6,6 +6,7 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 import mampc
 from builders import cost_of, distance, predicted, random_model
@@ -331,3 +332,35 @@ def test_small_move_weights_leave_the_optimum_what_it_is():
             cost = cost_of(problem, x, problem.model.u_op, reference, decision.plan)
             assert decision.objective == pytest.approx(cost, rel=1e-7, abs=1e-9)
             assert decision.objective <= best * (1 + 1e-6) + 1e-7
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+@pytest.mark.parametrize("rate", [-0.1, -1.4, -10.0])
+def test_outputs_that_run_far_away_from_their_zones_leave_the_optimum_what_it_is(rate, unit):
+    """A triple integrator: over a long horizon its errors are some 1e5 times what moves cost."""
+    model = mampc.StateSpace(
+        [[1, 1, 0.5], [0, 1, 1], [0, 0, 1]], [[1 / 6], [0.5], [1]], [[unit, 0, 0]], None, 1.0
+    )
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=110, control_horizon=4, output_weight=unit**-2, move_weight=1.0,
+        limits=mampc.Limits(u_min=-0.1, u_max=0.1), zone_below=0.03 * unit, zone_above=0.03 * unit,
+    )  # fmt: skip
+    controller, x = mampc.MAMPC(problem, mampc.MoveRules(max_moves=1)), np.array([0.1, -0.35, rate])
+    decision = controller.step(controller.initial_state(), x, np.zeros(1))
+
+    def cost(size, sample):
+        plan = np.where(np.arange(4) >= sample, size, 0.0)[:, None]
+        return cost_of(problem, x, np.zeros(1), np.zeros(1), plan)
+
+    best = min(
+        found
+        for sample in range(4)
+        for found in (
+            minimize_scalar(
+                cost, bounds=(-0.1, 0.1), method="bounded", args=(sample,), options={"xatol": 1e-12}
+            ).fun,
+            cost(0.1, sample),
+        )
+    )
+    assert decision.status is Status.OPTIMAL
+    assert decision.objective == pytest.approx(best, rel=1e-9)

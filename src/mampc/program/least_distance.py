@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mampc.base.checks import Array
+from mampc.base.checks import Array, BoolArray
 from mampc.program.daqp import ORDINARY, DaqpSolver
-from mampc.program.qp import QPSolution, QPStatus, QuadraticProgram
+from mampc.program.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram
 from mampc.program.refinement import refined
 
 SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
@@ -179,27 +179,48 @@ class LeastDistance:
         return bool(len(length) and np.linalg.cond(self._R / length) > DOUBTFUL)
 
     @cached_property
-    def _in_moves(self) -> DaqpSolver:
-        """The shortest moves within bounds, which is a question that R does not enter."""
-        v, k = self._v, len(self._R)
-        A = np.hstack([self._violations, self._rows])
-        return DaqpSolver(QuadraticProgram(np.eye(v + k), A, v))
+    def _firm(self) -> BoolArray:
+        """The rows without violations, on which alone it depends whether there are moves within all bounds."""
+        return np.asarray(~self._violations.any(axis=1))
+
+    @cached_property
+    def _within_firm(self) -> DaqpSolver:
+        """The shortest moves within these, whatever violations are and whatever the cost is."""
+        return DaqpSolver(QuadraticProgram(np.eye(len(self._R)), self._rows[self._firm], 0))
 
     def _tried_again(self, optimum: Array, lower: Array, upper: Array, failed: QPSolution) -> Nearest:
         """What a solver failed at, made exact from a guess; INFEASIBLE only if there are no moves within bounds.
 
-        Where bounds leave a move one value, rounding alone makes a tight tolerance fail. Far from zones as many bounds
-        are active as values count, and each not guessed takes a round: the guess is those of the shortest moves,
-        or those that no moves at all break.
+        Where bounds leave a move one value, rounding alone makes a tight tolerance fail, and where violations are far
+        larger than moves, the size of their rows.
         """
-        self._in_moves.start()
-        shortest = self._in_moves.solve(np.zeros(len(self._f)), lower, upper)
-        if shortest.status is QPStatus.INFEASIBLE:
+        firm = self._within_firm
+        low, high = (bounds[self._v :][self._firm] for bounds in (lower, upper))
+        far = max(float(low.max(initial=0.0)), -float(high.min(initial=0.0)))
+        scale = ldexp(1.0, frexp(far)[1]) if 0 < far < np.inf else 1.0
+        firm.start()
+        if firm.solve(np.zeros(len(self._R)), low / scale, high / scale).status is QPStatus.INFEASIBLE:
             return Nearest(None, np.inf, None, QPStatus.INFEASIBLE, failed.iterations)
-        guess = shortest.multipliers
-        if guess is None:
-            guess = np.where(upper < 0, 1.0, np.where(lower > 0, -1.0, 0.0))
-        return self._refined(optimum, lower, upper, guess, failed.iterations)
+        return self._refined(optimum, lower, upper, self._guess(lower, upper), failed.iterations)
+
+    def _guess(self, lower: Array, upper: Array) -> Array:
+        """The signs of bounds that may be active: those that no moves break, and where these push moves.
+
+        Of bounds that share a violation only the one that makes it largest. Far from zones as many bounds are active
+        as values count, and each that is not guessed takes a round.
+        """
+        v, each, firm = self._v, np.abs(self._violations), self._firm
+        by = np.maximum(lower, -upper)[v:, None]
+        violations = np.divide(by, each, out=np.zeros(each.shape), where=(each > 0) & (by > 0))
+        signs, push = np.where(upper < 0, 1.0, np.where(lower > 0, -1.0, 0.0)), np.zeros(len(each))
+        for j in np.flatnonzero(violations.any(axis=0)).tolist():
+            row = int(violations[:, j].argmax())
+            push[row] = signs[v + row] * (self._cost.linear[j] + self._cost.curvature[j] * violations[row, j])
+        signs[v:][~firm] = np.sign(push[~firm])
+        along = np.sign(self._rows @ -(push @ self._rows))
+        within = np.where(along > 0, upper[v:] < UNBOUNDED, lower[v:] > -UNBOUNDED)
+        signs[v:][firm & within] = along[firm & within]
+        return signs
 
     def _refined(
         self, optimum: Array, lower: Array, upper: Array, multipliers: Array, iterations: int
