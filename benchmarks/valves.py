@@ -26,7 +26,7 @@ from measuring import options
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "sticking-valves.toml"
 PRICES = (0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
-NAMES = ("price", "price, compensated")
+NAMES = ("price", "compensated price")
 
 
 class Outcome(NamedTuple):

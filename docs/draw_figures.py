@@ -56,7 +56,7 @@ def example_figures():
     shown = {
         "reference-filter": ("noise-free", "MPC", "MPC with a ramp"),
         "on-off": ("noisy", "on/off", "six starts an hour"),
-        "sticking-valves": ("sticking", "price", "price, compensated"),
+        "sticking-valves": ("sticking", "price", "compensated price"),
     }
     figures = {}
     for name, (scenario, *controllers) in shown.items():

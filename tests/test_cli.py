@@ -125,6 +125,10 @@ def test_help_shows_how(command, tmp_path):
     assert done.returncode == 0
     if command:
         assert f"mampc {command[0]} " in done.stdout.split("Example", 1)[1]
+    else:  # in the order of work
+        steps = ("inspect", "identify", "new", "run", "tune", "replay")
+        places = [done.stdout.index(f"│ {step} ") for step in steps]
+        assert places == sorted(places)
 
 
 def test_a_process_of_its_own_complains_alike(tmp_path):
