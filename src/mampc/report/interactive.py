@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -17,10 +17,12 @@ import numpy as np
 
 from mampc.base.errors import MampcError, listed
 from mampc.loop.run import Run
-from mampc.report.page_content import Means, duration, number, page_content
+from mampc.report.page_content import Means, number, page_content
 from mampc.report.tables import baseline, error_label, has_zones
 from mampc.study import StudyResult
 from mampc.study.schema import Study
+from mampc.study.writing import study_text
+from mampc.systems.properties import time_in_words
 
 _WEAR = ("input", "moves a day", "held for, on average", "travel a day")
 
@@ -45,7 +47,7 @@ def interactive_page(result: StudyResult, means: Means | None = None) -> str:
         "sentence": first["choices"][first["first"]]["sentence"],
         "shown": _shown(content, step),
         "rate": _rate(result.study),
-        "settings": "\n".join(_settings(result.study if means is None else means.study)),
+        "settings": study_text(result.study if means is None else means.study),
     }
     return template.format(
         **{name: html.escape(text) for name, text in texts.items()},
@@ -68,7 +70,7 @@ def _subtitle(result: StudyResult, kind: str) -> str:
     fit = " and ".join(f"{share:.0f}\u00a0% of {name}" for share, name in fits)
     return (
         f"{len(study.controllers)} {kind} on {listed(names.inputs)} and {listed(names.outputs)}, "
-        f"{study.steps} samples of {duration(study.dt)}. The model has {result.model.n_states} states"
+        f"{study.steps} samples of {time_in_words(study.dt)}. The model has {result.model.n_states} states"
         + (f" and explains {fit} in the record it comes from." if fit else ".")
     )
 
@@ -90,7 +92,7 @@ def _rate(study: Study) -> str:
     """How moves a day are counted."""
     return (
         f"Moves above {study.threshold:g}, but all of them in the travel. The run lasts "
-        f"{duration(study.steps * study.dt)}; a day is counted at its rate, steps of the reference included."
+        f"{time_in_words(study.steps * study.dt)}; a day is counted at its rate, steps of the reference included."
         + (" Errors are squared distances from the zones." if has_zones(study) else "")
     )
 
@@ -163,27 +165,3 @@ def _warnings(result: StudyResult) -> str:
         return ""
     lines = "".join(f"<li>{html.escape(warning)}</li>" for warning in result.warnings)
     return f"<div class='warnings'><strong>Warnings</strong><ul>{lines}</ul></div>"
-
-
-def _settings(study: Study) -> Iterator[str]:
-    """What the study's file says, one key or one entry of a list a line."""
-    for key, value in study.model_dump(exclude_unset=True, exclude={"place"}).items():
-        if isinstance(value, list):
-            yield from (f"{key}: {_inline(entry)}" for entry in value)
-        else:
-            yield f"{key}: {_inline(value)}"
-
-
-def _inline(value: Any) -> str:
-    """A value as it could stand in a study file."""
-    if isinstance(value, dict):
-        return ", ".join(f"{k} = {_nested(v)}" for k, v in value.items() if k != "published")
-    return _nested(value)
-
-
-def _nested(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{{ {', '.join(f'{k} = {_nested(v)}' for k, v in value.items())} }}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_nested, value))}]"
-    return json.dumps(value, ensure_ascii=False, default=str)

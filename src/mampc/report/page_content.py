@@ -17,6 +17,7 @@ from mampc.report.figures import result_looks
 from mampc.report.tables import baseline, error_label, has_zones
 from mampc.study import StudyResult
 from mampc.study.schema import Study
+from mampc.systems.properties import time_in_words
 
 DAY = 86400.0  # seconds
 MOST_NUMBERS = 100_000  # in the trajectories of a page, which keeps it below 6 MB
@@ -195,7 +196,7 @@ def _wear(run: Run, metrics: Metrics, dt: float) -> Iterator[list[str]]:
         yield [
             run.names.with_unit(name),
             number(float(_a_day(metrics, dt)[i])),
-            duration(metrics.steps * dt / (round(float(metrics.sparse_density[i] * metrics.steps)) + 1)),
+            time_in_words(metrics.steps * dt / (round(float(metrics.sparse_density[i] * metrics.steps)) + 1)),
             number(float(metrics.travel[i]) / days),
         ]
 
@@ -207,10 +208,3 @@ def number(value: float, digits: int = 2) -> str:
     rounded = float(f"{value:.{digits}g}")
     decimals = digits - 1 - int(np.floor(np.log10(abs(rounded)))) if rounded else 0
     return f"{rounded:,.{max(decimals, 0)}f}".replace(",", "\u202f")
-
-
-def duration(seconds: float) -> str:
-    for unit, size in (("days", DAY), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * size:
-            return f"{number(seconds / size)}\u00a0{unit}"
-    return f"{number(seconds)}\u00a0s"
