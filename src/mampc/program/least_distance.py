@@ -20,6 +20,7 @@ from mampc.base.checks import Array, BoolArray
 from mampc.program.daqp import ORDINARY, DaqpSolver
 from mampc.program.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram
 from mampc.program.refinement import refined
+from mampc.program.sample import Indices
 
 SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
 UNCERTAIN = 1e-10  # of the excess: what a solver's slack may be worth before the solution is refined
@@ -184,6 +185,14 @@ class LeastDistance:
         return np.asarray(~self._violations.any(axis=1))
 
     @cached_property
+    def _kinds(self) -> Indices:
+        """Which bounds share a violation, as a number each, shape (v + b,)."""
+        kinds = np.arange(self._v + len(self._rows))
+        rows, violations = np.nonzero(self._violations)
+        kinds[self._v + rows] = violations
+        return kinds
+
+    @cached_property
     def _within_firm(self) -> DaqpSolver:
         """The shortest moves within these, whatever violations are and whatever the cost is."""
         return DaqpSolver(QuadraticProgram(np.eye(len(self._R)), self._rows[self._firm], 0))
@@ -232,7 +241,7 @@ class LeastDistance:
         A[:v, :v], A[v:, :v], A[v:, v:] = np.eye(v), self._violations, self._rows
         reached = self._R.dot(optimum)
         c = np.concatenate([-0.5 * self._cost.linear / root, reached])
-        better = refined(F, c, A, lower, upper, multipliers)
+        better = refined(F, c, A, lower, upper, multipliers, self._kinds)
         if better is None:
             return Nearest(None, np.inf, None, QPStatus.FAILED, iterations)
         moves = better.z[v:]

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.program.sample import Indices
 
 BROKEN = 1e-11  # of the sizes in a row: a bound missed by more is not kept
 WRONG = 1e-11  # of the largest multiplier: one of the wrong sign by more is wrong
@@ -51,8 +52,14 @@ class Cost(NamedTuple):
         return cls(F, c, factor, optimum, np.abs(np.linalg.solve(factor, Q.T)) @ lost)
 
 
-def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array) -> Refined | None:
-    """The optimum, from the active bounds that multipliers `pull` (rows,) tell; None if not found."""
+def refined(
+    F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array, kinds: Indices | None = None
+) -> Refined | None:
+    """The optimum, from the active bounds that multipliers `pull` (rows,) tell; None if not found.
+
+    Of rows of one kind, shape (rows,), mostly one at a time is active; by default each is of its own.
+    """
+    kinds = np.arange(len(A)) if kinds is None else kinds
     length = np.sqrt(np.square(A).sum(axis=1))
     length[length == 0] = 1.0
     A, low, high = A / length[:, None], low / length, high / length
@@ -69,9 +76,12 @@ def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array) 
         excess = np.maximum(rows - high, low - rows) - BROKEN * (np.abs(A) @ np.abs(z))
         excess[list(signs)] = -np.inf
         if turn < AT_ONCE and (wrong or (excess > 0).any()):
+            broken = np.flatnonzero(excess > 0)
+            broken = broken[np.argsort(-excess[broken], kind="stable")]
+            broken = broken[np.unique(kinds[broken], return_index=True)[1]]
             for i in wrong:
                 del signs[i]
-            for i in np.flatnonzero(excess > 0).tolist():
+            for i in broken.tolist():
                 signs[i] = 1.0 if rows[i] > high[i] else -1.0
             continue
         if wrong:
@@ -133,15 +143,14 @@ def _at(
     cost: Cost, A: Array, low: Array, high: Array, signs: dict[int, float]
 ) -> tuple[Array, dict[int, float], dict[int, float]] | None:
     """The optimum on active bounds, their multipliers (positive ones pull back), and those that say something new."""
-    F, c = cost.F, cost.c
-    basis, kept = np.zeros((0, A.shape[1])), []
-    for i in signs:
-        rest = A[i] - (A[i] @ basis.T) @ basis
-        rest = rest - (rest @ basis.T) @ basis
-        left = float(np.sqrt(rest @ rest))
-        if left > DEPENDENT:
-            kept.append(i)
-            basis = np.vstack([basis, rest / left])
+    F, c, kept = cost.F, cost.c, list(signs)
+    while kept:
+        # What those before leave of each row.
+        left = np.abs(np.diag(np.linalg.qr(A[kept].T, mode="r")))
+        known = np.flatnonzero(left <= DEPENDENT)
+        if not len(known) and len(kept) <= len(left):
+            break
+        del kept[known[0] if len(known) else len(left)]
     k = len(kept)
     sign = np.array([signs[i] for i in kept])
     W, b = A[kept], np.where(sign > 0, high[kept], low[kept])
