@@ -217,7 +217,7 @@ def test_a_model_is_excited_as_it_responds():
         ({"u": np.full((3, 2), np.nan)}, "u: expected finite numbers"),
         ({"u": [["a", "b"]]}, "u: expected real numbers"),
         ({"noise": [0.1, 0.1, 0.1]}, "noise: expected a scalar or 2 values"),
-        ({"noise": -0.1}, "noise: expected standard deviations at or above zero"),
+        ({"noise": -0.1}, "noise: expected numbers of at least 0"),
         ({"seed": -1}, "seed: expected"),
         ({"x0": [1.0, 2.0]}, "x0: expected a scalar or 4 values"),
         ({"x0": [1.0, 2.0, 3.0, np.nan]}, "x0: expected finite numbers"),

@@ -218,7 +218,7 @@ def test_loads_and_reference_changes_may_be_told_where_inputs_have_no_limits():
         ({"limits": None}, "limits: expected mampc.Limits"),
         ({"limits": mampc.Limits(u_min=0.0)}, "u_min and u_max"),
         ({"noise": [0.1, 0.1, 0.1]}, "noise"),
-        ({"noise": 0.0}, "noise: expected positive"),
+        ({"noise": 0.0}, "noise: expected numbers above 0"),
         ({"reference_changes": -1.0}, "reference_changes"),
         ({"loads": [3]}, "loads"),
         ({"loads": 3}, "loads"),

@@ -73,14 +73,28 @@ def as_matrix(name: str, value: Any, rows: int | None = None, columns: int | Non
     return require_finite(name, array)
 
 
-def as_vector(name: str, value: Any, size: int) -> Array:
-    """A finite vector of `size` entries, a scalar meaning that value in each; raises `MampcError`."""
+def as_vector(
+    name: str, value: Any, size: int, minimum: float = -np.inf, *, exclusive: bool = False
+) -> Array:
+    """A finite vector of `size` entries of at least `minimum` (above it when `exclusive`), a scalar meaning that
+    value in each; raises `MampcError`.
+    """
     array = as_array(name, value)
     if array.ndim == 0:
         array = np.full(size, float(array))
     if array.shape != (size,):
         raise MampcError(f"{name}: expected a scalar or {size} values, received shape {array.shape}")
-    return require_finite(name, array)
+    least = require_finite(name, array).min(initial=np.inf)
+    if least < minimum or (exclusive and least == minimum):
+        raise MampcError(f"{name}: expected numbers{_bound(minimum, exclusive)}, received {shown(value)}")
+    return array
+
+
+def as_one_or_each(name: str, value: Any, minimum: float) -> float | tuple[float, ...]:
+    """A finite number of at least `minimum`, or a tuple of them, one per signal; raises `MampcError`."""
+    array = as_array(name, value)
+    vector = as_vector(name, array, array.size, minimum)
+    return tuple(vector.tolist()) if array.ndim else float(array)
 
 
 def as_limit(name: str, value: Any, size: int, unlimited: float) -> Array:
@@ -152,9 +166,14 @@ def as_number(name: str, value: Any, minimum: float = -np.inf, *, exclusive: boo
         with suppress(OverflowError):  # a whole number may be larger than any float
             number = float(value)
     if not np.isfinite(number) or number < minimum or (exclusive and number == minimum):
-        bound = "" if minimum == -np.inf else f" {'above' if exclusive else 'of at least'} {minimum:g}"
-        raise MampcError(f"{name}: expected a finite number{bound}, received {shown(value)}")
+        raise MampcError(
+            f"{name}: expected a finite number{_bound(minimum, exclusive)}, received {shown(value)}"
+        )
     return number
+
+
+def _bound(minimum: float, exclusive: bool) -> str:
+    return "" if minimum == -np.inf else f" {'above' if exclusive else 'of at least'} {minimum:g}"
 
 
 def require_finite(name: str, array: Array) -> Array:

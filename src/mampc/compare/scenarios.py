@@ -69,14 +69,10 @@ class Surroundings:
         guessed = noise is None
         if noise is None:
             noise = guessed_noise(problem)
-        sizes = as_vector("noise", noise, l)
-        if (sizes <= 0).any():
-            raise MampcError(f"noise: expected positive standard deviations, received {sizes}")
+        sizes = as_vector("noise", noise, l, 0.0, exclusive=True)
         changes = CHANGE * sizes
         if reference_changes is not None:
-            changes = as_vector("reference_changes", reference_changes, l)
-            if (changes < 0).any():
-                raise MampcError(f"reference_changes: expected numbers of at least 0, received {changes}")
+            changes = as_vector("reference_changes", reference_changes, l, 0.0)
         kinds = every_kind(model, sizes, scenario_length(problem)) if loads is None else _given(loads)
         return cls(sizes, guessed, changes, reference_changes is None, kinds)
 

@@ -64,11 +64,7 @@ class MAMPC(Controller):
                 f"on_limit_violation: expected one of {', '.join(ON_LIMIT_VIOLATION)}, "
                 f"received {on_limit_violation!r}"
             )
-        margin = as_vector("violation_margin", violation_margin, problem.model.n_outputs)
-        if (margin < 0).any():
-            raise MampcError(
-                f"violation_margin: expected values of at least 0, received {violation_margin!r}"
-            )
+        margin = as_vector("violation_margin", violation_margin, problem.model.n_outputs, 0.0)
         self._margin = margin if on_limit_violation == "ignore_budget" else None
         if self._margin is not None and self.levels is not None:
             raise MampcError(

@@ -179,9 +179,7 @@ def excite(
         for k, inputs in enumerate(signal):
             y[k] = plant.output(x, inputs)
             x = advance(plant, x, inputs, dt, sizes=sizes)
-    spread = as_vector("noise", noise, l)
-    if (spread < 0).any():
-        raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
+    spread = as_vector("noise", noise, l, 0.0)
     y = y + spread * np.random.default_rng(as_whole("seed", seed, 0)).standard_normal(y.shape)
     return IOData(signal, y, dt, names)
 

@@ -103,12 +103,16 @@ class KalmanFilter(Estimator):
             raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")
         reach = response_within_reach(model)
         noise = white_noise(model.noise) if measurement_noise is None else measurement_noise
-        noise = alike(reach) if noise is None else _positive("measurement_noise", noise, l)
+        noise = (
+            alike(reach) if noise is None else as_vector("measurement_noise", noise, l, 0.0, exclusive=True)
+        )
         unit = input_units(reach, noise)
         directions = directions_of(model, disturbance, reach, noise, unit)
         A, C = _augmented(model, directions)
-        wander = 0.3 * noise if drift is None else _positive("drift", drift, l)
-        moving = unit if input_noise is None else _positive("input_noise", input_noise, m)
+        wander = 0.3 * noise if drift is None else as_vector("drift", drift, l, 0.0, exclusive=True)
+        moving = (
+            unit if input_noise is None else as_vector("input_noise", input_noise, m, 0.0, exclusive=True)
+        )
         driven = model.B[:, :m] * moving
         Q = np.zeros((len(A), len(A)))
         sizes = state_sizes(model.A, driven, model.C / noise[:, None])
@@ -284,10 +288,3 @@ def _require_detectable(A: Array, C: Array, disturbance: str) -> None:
                     f"whose mode at {pole:.4g} cannot be told from a disturbance"
                     f"{hint if disturbance == 'output' else ''}"
                 )
-
-
-def _positive(name: str, value: Any, size: int) -> Array:
-    values = as_vector(name, value, size)
-    if (values <= 0).any():
-        raise MampcError(f"{name}: expected positive numbers, received {values}")
-    return values

@@ -90,9 +90,7 @@ def learn_gains(
         raise MampcError(
             "noise: expected the standard deviation of each output's measurement noise, received none"
         )
-    sizes = as_vector("noise", noise, l)
-    if (sizes <= 0).any():
-        raise MampcError(f"noise: expected positive numbers, received {sizes}")
+    sizes = as_vector("noise", noise, l, 0.0, exclusive=True)
     _require_apart(model, sizes)
     total = sum(len(y) for _, y in known)
     if total < FEWEST:

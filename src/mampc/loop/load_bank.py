@@ -83,9 +83,7 @@ class LoadBank(Estimator):
                 "noise: expected the standard deviation of each output's measurement noise, received none; "
                 "give it, or let LoadBank.for_problem guess"
             )
-        sizes = as_vector("noise", noise, model.n_outputs)
-        if (sizes <= 0).any():
-            raise MampcError(f"noise: expected positive numbers, received {sizes}")
+        sizes = as_vector("noise", noise, model.n_outputs, 0.0, exclusive=True)
         self._told = NOISE_GUESSED if as_flag("guessed", guessed) else NOISE_TOLD
         self.model, self.noise, self.hypotheses = model, sizes, tuple(hypotheses)
         self.loads = Loads.of(model, sizes)

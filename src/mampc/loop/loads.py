@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_matrix, as_number, as_vector
+from mampc.base.checks import Array, as_array, as_matrix, as_number, as_one_or_each, as_vector
 from mampc.base.errors import MampcError, shown
 from mampc.systems.state_space import StateSpace
 
@@ -55,12 +55,7 @@ class _At:
         for name in self._positive:
             object.__setattr__(self, name, as_number(name, getattr(self, name), 0.0, exclusive=True))
         if hasattr(self, "size"):
-            size = as_array("size", self.size)
-            if size.ndim > 1 or not (np.isfinite(size).all() and (size >= 0).all()):
-                raise MampcError(
-                    f"size: expected one number of at least 0 or one per signal, received {shown(self.size)}"
-                )
-            object.__setattr__(self, "size", tuple(size.tolist()) if size.ndim else float(size))
+            object.__setattr__(self, "size", as_one_or_each("size", self.size, 0.0))
 
     _positive: ClassVar[tuple[str, ...]] = ()
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array, as_number, as_vector, as_weight, as_whole
-from mampc.base.errors import MampcError
 from mampc.base.tolerances import SAME
 from mampc.program.zone import Zone
 
@@ -100,9 +99,7 @@ def compute(
     """
     skip = as_whole("skip", skip, 0, len(u) - 1)
     threshold = as_number("threshold", threshold, 0.0)
-    band = as_vector("dead_band", dead_band, u.shape[1])
-    if (band < 0).any():
-        raise MampcError(f"dead_band: expected numbers of at least 0, received {dead_band!r}")
+    band = as_vector("dead_band", dead_band, u.shape[1], 0.0)
     changes = np.diff(np.vstack([u_initial, u]), axis=0)[skip:]
     size = np.abs(changes)
     low, high = (r, r) if zone is None else (zone.low, zone.high)

@@ -95,9 +95,7 @@ class Regulator:
         self._v_shape = (model.n_disturbances,)
         tolerance = None
         if applied_tolerance is not None:
-            tolerance = as_vector("applied_tolerance", applied_tolerance, model.n_inputs)
-            if (tolerance < 0).any():
-                raise MampcError(f"applied_tolerance: expected at least 0, received {applied_tolerance!r}")
+            tolerance = as_vector("applied_tolerance", applied_tolerance, model.n_inputs, 0.0)
         self._actuators = Actuators(controller.problem.limits, tolerance)
         expected, received = _sizes(model), _sizes(self.estimator.model)
         if received != expected:

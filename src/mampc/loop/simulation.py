@@ -243,9 +243,7 @@ def acting_on(
         zone = Zone(low, high)
         for controller in regulator.controller.each:
             controller.condensed.parameter.of_zones(zone)  # complains where it does not fit
-    spread = as_vector("noise", noise, l)
-    if (spread < 0).any():
-        raise MampcError(f"noise: expected standard deviations at or above zero, received {spread}")
+    spread = as_vector("noise", noise, l, 0.0)
     usual = getattr(plant, "v_op", np.zeros(d))
     at = {
         "input": _trajectory("input_disturbance", _default(input_disturbance, 0.0), m, T),

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_vector
-from mampc.base.errors import MampcError, shown
+from mampc.base.checks import Array, as_array, as_one_or_each, as_vector
+from mampc.base.errors import MampcError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,13 +43,7 @@ class Valves:
 
     def __post_init__(self) -> None:
         for name in ("band", "jump"):
-            given = as_array(name, getattr(self, name))
-            if given.ndim > 1 or not (np.isfinite(given).all() and (given >= 0).all()):
-                raise MampcError(
-                    f"{name}: expected one number of at least 0 or one per input, received "
-                    f"{shown(getattr(self, name))}"
-                )
-            object.__setattr__(self, name, tuple(given.tolist()) if given.ndim else float(given))
+            object.__setattr__(self, name, as_one_or_each(name, getattr(self, name), 0.0))
         band, jump = np.asarray(self.band), np.asarray(self.jump)
         if band.ndim and jump.ndim and band.shape != jump.shape:
             raise MampcError(f"jump: expected as many values as band, {len(band)}, received {len(jump)}")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_whole, require_finite
+from mampc.base.checks import Array, as_one_or_each, as_whole
 from mampc.base.errors import MampcError
 from mampc.program.levels import as_levels
 
@@ -61,12 +61,7 @@ class MoveRules:
         if self.max_moves_per_step is not None:
             as_whole("max_moves_per_step", self.max_moves_per_step, 1)
         for name in ("price", "min_size"):
-            given = getattr(self, name)
-            value = require_finite(name, as_array(name, given))
-            if value.ndim > 1 or (value < 0).any():
-                raise MampcError(f"{name}: expected one value >= 0 or one per input, received {given!r}")
-            # Plain numbers: out of the caller's reach, and comparable.
-            object.__setattr__(self, name, tuple(value.tolist()) if value.ndim else float(value))
+            object.__setattr__(self, name, as_one_or_each(name, getattr(self, name), 0.0))
         if self.counting == "simultaneous" and np.ndim(self.price):
             raise MampcError(
                 "price: expected one price per sample with counting='simultaneous', received one per input"

@@ -48,15 +48,12 @@ class QuadrupleTank:
 
     def __post_init__(self) -> None:
         for name, size in (("areas", 4), ("outlets", 4), ("k_pump", 2), ("gamma", 2), ("u_op", 2)):
-            values = as_vector(name, getattr(self, name), size)
-            if name not in ("gamma", "u_op") and (values <= 0).any():
-                raise MampcError(f"QuadrupleTank.{name}: expected positive numbers, received {values}")
-            if name == "u_op" and (values < 0).any():
-                raise MampcError(f"QuadrupleTank.u_op: expected no negative input, received {values}")
-            object.__setattr__(self, name, tuple(map(float, values)))
+            above = name not in ("gamma", "u_op")
+            given = as_vector(f"QuadrupleTank.{name}", getattr(self, name), size, 0.0, exclusive=above)
+            object.__setattr__(self, name, tuple(given.tolist()))
         as_number("QuadrupleTank.gravity", self.gravity, 0.0, exclusive=True)
         as_number("QuadrupleTank.k_c", self.k_c, 0.0, exclusive=True)
-        if not all(0 <= split <= 1 for split in self.gamma):
+        if max(self.gamma) > 1:
             raise MampcError(f"QuadrupleTank.gamma: expected numbers within 0..1, received {self.gamma}")
         # Levels rise by u @ inflow + sqrt(h) @ outflow: each pump feeds a lower and an upper tank, and each upper
         # tank the lower one below it.

@@ -100,10 +100,8 @@ class SolidOxideFuelCell:
             if value >= 1.0:
                 raise MampcError(f"SolidOxideFuelCell.{name}: expected a number below 1, received {value}")
         for name, size in (("molar_masses", 4), ("u_op", 2)):
-            values = as_vector(name, getattr(self, name), size)
-            if (values <= 0).any():
-                raise MampcError(f"SolidOxideFuelCell.{name}: expected positive numbers, received {values}")
-            object.__setattr__(self, name, tuple(map(float, values)))
+            given = as_vector(f"SolidOxideFuelCell.{name}", getattr(self, name), size, 0.0, exclusive=True)
+            object.__setattr__(self, name, tuple(given.tolist()))
 
     def derivative(self, x: Array, u: Array) -> Array:
         """Rates of the partial pressures in Pa/s: inflow minus outflow plus reaction; always finite."""

@@ -58,10 +58,7 @@ class VanDeVusse:
     def __post_init__(self) -> None:
         for name in ("k1", "k2", "k3", "feed"):
             as_number(f"VanDeVusse.{name}", getattr(self, name), 0.0, exclusive=True)
-        u_op = as_vector("u_op", self.u_op, 1)
-        if (u_op < 0).any():
-            raise MampcError(f"VanDeVusse.u_op: expected no negative input, received {u_op}")
-        object.__setattr__(self, "u_op", tuple(u_op.tolist()))
+        object.__setattr__(self, "u_op", tuple(as_vector("VanDeVusse.u_op", self.u_op, 1, 0.0).tolist()))
 
     @property
     def v_op(self) -> tuple[float, ...]:

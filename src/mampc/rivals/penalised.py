@@ -72,10 +72,7 @@ class Penalised(Controller):
         self._rounds = as_whole("rounds", rounds, 1)
         self._tolerance = as_number("tolerance", tolerance, 0.0)
         m, n_c = problem.model.n_inputs, problem.control_horizon
-        size = as_vector("size", penalty.size, m)
-        if not (size > 0).all():
-            raise MampcError(f"size: expected values above 0, received {penalty.size!r}")
-        self._size = np.tile(size, n_c)
+        self._size = np.tile(as_vector("size", penalty.size, m, 0.0, exclusive=True), n_c)
         self._target = SteadyTarget(problem, self.condensed.parameter)
         self._terminal = _Terminal(problem, self.condensed.parameter) if terminal else None
         n = self.condensed.n_moves

@@ -101,9 +101,7 @@ class DeadBand(Rule):
 
     def __init__(self, controller: Controller, *, size: Any, kind: str = "each") -> None:
         super().__init__(controller)
-        self._size = as_vector("size", size, self.problem.model.n_inputs)
-        if (self._size < 0).any():
-            raise MampcError(f"size: expected values of at least 0, received {size!r}")
+        self._size = as_vector("size", size, self.problem.model.n_inputs, 0.0)
         if kind not in BANDS:
             raise MampcError(f"kind: expected one of {', '.join(BANDS)}, received {kind!r}")
         self.kind = kind
@@ -130,9 +128,7 @@ class Rounded(Rule):
 
     def __init__(self, controller: Controller, *, step: Any, hysteresis: float = 0.0) -> None:
         super().__init__(controller)
-        self._step = as_vector("step", step, self.problem.model.n_inputs)
-        if not (self._step > 0).all():
-            raise MampcError(f"step: expected values above 0, received {step!r}")
+        self._step = as_vector("step", step, self.problem.model.n_inputs, 0.0, exclusive=True)
         self._beyond = 0.5 + as_number("hysteresis", hysteresis, 0.0)
 
     def chosen(self, wanted: Array, u: Array) -> Array:
@@ -207,9 +203,7 @@ class EventTriggered(Predicted):
 
     def __init__(self, controller: Controller, *, threshold: Any) -> None:
         super().__init__(controller)
-        self._threshold = as_vector("threshold", threshold, self.problem.model.n_outputs)
-        if (self._threshold < 0).any():
-            raise MampcError(f"threshold: expected values of at least 0, received {threshold!r}")
+        self._threshold = as_vector("threshold", threshold, self.problem.model.n_outputs, 0.0)
 
     def plan(self, sample: Sample, state: ControllerState) -> Plan:
         """The controller's first moves at an event; the state remembers its reference and what it predicted."""
@@ -243,9 +237,7 @@ class QuietZone(Predicted):
             raise MampcError(
                 "controller: expected one with set points, received outputs that have a zone already"
             )
-        self._band = as_vector("band", band, self.problem.model.n_outputs)
-        if (self._band < 0).any():
-            raise MampcError(f"band: expected values of at least 0, received {band!r}")
+        self._band = as_vector("band", band, self.problem.model.n_outputs, 0.0)
 
     def is_due(self, sample: Sample, state: ControllerState) -> bool:
         deviation = sample.parameter[self.condensed.parameter.reference.start :].reshape(-1, len(self._band))

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array, as_vector
-from mampc.base.errors import MampcError
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +31,7 @@ class Noise:
     def __post_init__(self) -> None:
         size = np.size(self.output)
         for name in ("output", "drift"):
-            value: Any = as_vector(f"noise.{name}", getattr(self, name), size)
-            if (value < 0).any():
-                raise MampcError(f"noise.{name}: expected numbers of at least zero, received {value}")
+            value: Any = as_vector(f"noise.{name}", getattr(self, name), size, 0.0)
             value.flags.writeable = False
             object.__setattr__(self, name, value)
 
