@@ -11,7 +11,7 @@ from builders import random_model
 from mampc import Status
 from mampc.methods.exact import ranking, search
 from mampc.moves import level_search
-from mampc.moves.last_first import LastFirst
+from mampc.moves.last_first import LastFirst, _least_squares
 from referees import objective_of
 from seeds import seeds
 from test_levels import instance, random_rules
@@ -90,6 +90,29 @@ def test_courses_decided_from_either_end_have_the_same_optimum(seed, monkeypatch
     for decision in short:
         assert decision.lower_bound <= forward.objective * (1 + 1e-9)
         assert decision.objective >= forward.objective * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("seed", seeds(300, quick=30))
+def test_what_single_jumps_leave_is_no_more_than_the_truth_where_squares_cancel(seed):
+    rng = np.random.default_rng(seed)
+    p, inputs, nodes = int(rng.integers(2, 120)), int(rng.integers(1, 4)), 5
+    jumps = [np.cumsum(rng.standard_normal((p, 6)), axis=0) for _ in range(inputs)]
+    size = rng.uniform(-3, 3, (nodes, inputs))
+    at = rng.integers(6, size=inputs)
+    made = sum(size[:, a, None] * jumps[a][:, at[a]] for a in range(inputs))
+    rest = (made + 10.0 ** rng.uniform(-12, 0) * rng.standard_normal((nodes, p)))[:, None]
+    truth = np.full(nodes, np.inf, dtype=np.longdouble)
+    for times in product(range(6), repeat=inputs):
+        left = rest[:, 0].astype(np.longdouble)
+        for a, t in enumerate(times):
+            left = left - np.longdouble(size[:, a, None]) * jumps[a][:, t]
+        truth = np.minimum(truth, np.square(left).sum(axis=1))
+    found = _least_squares(rest, size, jumps)[:, 0]
+    sizes = np.square(rest[:, 0]).sum(axis=1) + sum(
+        size[:, a] ** 2 * np.square(jumps[a]).sum(axis=0).max() for a in range(inputs)
+    )
+    assert (found <= truth).all()
+    assert (found >= truth - 1e-12 * sizes).all()
 
 
 def test_coarse_levels_of_three_inputs_with_a_price_are_proven_in_few_nodes(monkeypatch):

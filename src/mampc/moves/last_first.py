@@ -36,7 +36,6 @@ NEAREST = 5  # levels that it tries for each
 COURSES = 1000  # that are priced for one node
 AT_ONCE = 2**17  # courses that are priced at once
 WAITING = 2**24  # numbers in the nodes that wait
-LOST = 1e-14  # of squares that are added up: what rounding may make of them
 LATER = 1_000_000  # samples
 
 
@@ -327,15 +326,17 @@ def _least_squares(rest: Array, size: Array, jumps: list[Array]) -> Array:
     def along(values: Array, *axes: int) -> Array:
         return values.reshape(*values.shape[:2], *[n if a in axes else 1 for a, n in enumerate(times)])
 
-    squares = np.square(rest).sum(axis=2)
-    total, lost = along(squares), LOST * squares
+    squares, n = np.square(rest).sum(axis=2), len(jumps)
+    total, added = along(squares), squares.copy()
     for a, jump in enumerate(jumps):
         s, own = size[:, a, None, None], np.square(jump).sum(axis=0)
         total = total + along(s * (s * own - 2 * (rest @ jump)), a)
-        lost += LOST * np.square(s[:, 0]) * own.max()
-    for a, b in combinations(range(len(jumps)), 2):
+        added += np.square(s[:, 0]) * own.max()
+    for a, b in combinations(range(n), 2):
         s = 2 * size[:, a, None, None, None] * size[:, b, None, None, None]
         total = total + along(s * (jumps[a].T @ jumps[b]), a, b)
-    # Large squares may cancel each other: no bound may gain by what rounding leaves of them.
-    least: Array = total.reshape(*squares.shape, -1).min(axis=2) - len(jumps) * lost
+    # Large squares may cancel each other: no bound may gain by what rounding leaves of them. The products' sizes sum up
+    # to n + 1 times what was added at most, and a sum of k products is wrong by k half units of each.
+    lost = (n + 1) / 2 * (rest.shape[2] + n * n + 4) * np.finfo(float).eps * added
+    least: Array = total.reshape(*squares.shape, -1).min(axis=2) - lost
     return least
