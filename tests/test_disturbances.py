@@ -76,6 +76,22 @@ def test_a_load_leaves_no_offset_and_drains_nothing_whatever_the_slow_pole(model
     np.testing.assert_allclose(run.y[-20:], np.tile(model.y_op, (20, 1)), atol=2e-3 * unheeded)
 
 
+@pytest.mark.parametrize("pole", [1.03, 1.1, 1.25, 1.4])
+@pytest.mark.parametrize(
+    "model", [level, two_outputs, lambda p: delayed_level(p, 3)], ids=["1 x 1", "2 x 2", "delayed"]
+)
+def test_loads_on_a_plant_that_runs_away_are_found_as_fast_as_elsewhere(model, pole):
+    model = model(pole)
+    problem = mampc.TrackingProblem(model, prediction_horizon=20, control_horizon=5, move_weight=1e-3)
+    load = np.zeros((80, model.n_inputs))
+    load[10:] = 1.0
+    run = mampc.simulate(
+        model, mampc.Regulator(mampc.MPC(problem)), model.y_op, steps=80, input_disturbance=load
+    )
+    error = np.abs(run.y - model.y_op)
+    assert error[50:].max() < 0.05 * error.max()
+
+
 @pytest.mark.parametrize("pole", [0.99, 0.999, 1.0, 1.01])
 def test_a_wrong_gain_leaves_no_offset_either(pole):
     model = two_outputs(pole)

@@ -172,11 +172,11 @@ def test_least_sizes_take_a_bounded_number_of_programs(name, monkeypatch):
 
 
 @every_heuristic
-def test_beyond_its_time_a_method_keeps_the_best_plan_so_far(name, monkeypatch):
+def test_beyond_its_time_a_method_keeps_the_best_plan_so_far_and_says_so(name, monkeypatch):
     monkeypatch.setattr("mampc.methods.heuristic.SECONDS", 0.0)
     problem, past, x, reference = sample(5, control_horizon=10)
     controller = controller_of(problem, MoveRules(min_size=0.4, price=1e-4), name)
-    assert not decide(controller, past, x, reference).held
+    assert decide(controller, past, x, reference).status is mampc.Status.TIME_LIMIT
 
 
 @every_method

@@ -18,6 +18,7 @@ from mampc.systems.modes import apart
 from mampc.systems.state_space import StateSpace
 
 REACH = 20  # samples within which an input shows what it does, for estimators that filter over up to ten
+RUNAWAY = 1.01  # size of the poles from which a response within reach says more of them than of the input
 SLOW = 0.025  # distance from one, of the poles of modes that a load must be seen to enter
 _NOTHING = 1e-6  # of the largest: a direction in which inputs do nothing
 
@@ -44,8 +45,13 @@ class Directions:
 def response_within_reach(model: StateSpace) -> Array:
     """The largest change of each output within `REACH` samples after a unit step of each input, shape (l, m).
 
-    It is the gain of what settles within that time, and finite and continuous for what does not.
+    It is the gain of what settles within that time, and finite for what does not. A mode that runs away counts as one
+    that settles as fast (its pole p as 1/p), which is what feedback at least effort makes of it.
     """
+    A, T, count = apart(model.A, lambda pole: abs(pole) > RUNAWAY)
+    if count > 0:
+        A[:count, :count] = np.linalg.inv(A[:count, :count])
+        model = StateSpace(A, np.linalg.solve(T, model.B), model.C @ T, model.D, model.dt)
     response = model.step_response(model.n_states + 2 * REACH + 1)[:, :, : model.n_inputs]
     before = np.concatenate([np.zeros((1, *response.shape[1:])), response])[: len(response)]
     change = np.concatenate([response[:1], response[REACH:] - before[:-REACH]])

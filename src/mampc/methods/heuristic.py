@@ -115,6 +115,7 @@ class HeuristicSearch:
             ended = Ended(best.solved)
         except StopIteration as end:
             ended = end.value
+        status = Status.TIME_LIMIT if perf_counter() >= deadline else status
         best.offer(solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
         guess, remarks = self._shifted(ended.moves), self._remarks(allowance)
         if best.moves is not None:

@@ -93,7 +93,7 @@ class StateSpace:
             "y_op": as_vector("y_op", 0.0 if self.y_op is None else self.y_op, l),
             "v_op": as_vector("v_op", 0.0 if self.v_op is None else self.v_op, d),
         }  # fmt: skip
-        if self.noise is not None and self.noise.output.shape != (l,):
+        if self.noise is not None and as_instance("noise", self.noise, Noise).output.shape != (l,):
             raise MampcError(f"noise: expected {l} outputs, received {self.noise.output.size}")
         if self.evidence is not None and not self.evidence.matches(l, columns):
             raise MampcError(f"evidence: expected {columns} inputs and {l} outputs, received other numbers")
