@@ -311,7 +311,7 @@ def test_stabilising_mirrors_poles_and_says_so():
         (
             300,
             {"unstable": "ignore"},
-            "unstable: expected 'auto', 'stabilise' or 'refuse', received 'ignore'",
+            "unstable: expected one of auto, stabilise, refuse, received 'ignore'",
         ),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from contextlib import suppress
 from typing import Any, TypeAlias, TypeVar
 
@@ -143,6 +144,13 @@ def as_whole(name: str, value: Any, minimum: int, maximum: int | None = None) ->
             f"{name}: expected a whole number of at least {minimum}{upto}, received {shown(value)}"
         )
     return int(value)
+
+
+def as_choice(name: str, value: Any, choices: Collection[str]) -> str:
+    """One of some words; raises `MampcError` for anything else."""
+    if not isinstance(value, str) or value not in choices:
+        raise MampcError(f"{name}: expected one of {', '.join(choices)}, received {shown(value)}")
+    return value
 
 
 def as_instance(name: str, value: Any, kind: type[T]) -> T:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from copy import copy
 from typing import Any
 
-from mampc.base.checks import Array
+from mampc.base.checks import Array, as_choice
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import ControllerState, Decision
@@ -86,9 +86,7 @@ class ControllerBank(Controller):
             MampcError: a name that there is not, or arrays of the wrong shape.
         """
         name = self.usual if variant is None else variant
-        controller = self.variants.get(name)
-        if controller is None:
-            raise MampcError(f"variant: expected one of {', '.join(self.variants)}, received {name!r}")
+        controller = self.variants[as_choice("variant", name, self.variants)]
         # Active bounds are a start for programs with as many; others begin anew.
         alike = controller.condensed.bounds.size == self.condensed.bounds.size
         if not alike and isinstance(state, ControllerState):

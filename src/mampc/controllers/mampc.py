@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_instance, as_vector
+from mampc.base.checks import Array, as_choice, as_instance, as_vector
 from mampc.base.errors import MampcError
 from mampc.base.tolerances import ROUNDING, SAME, URGENT
 from mampc.base.words import Remark, Status
@@ -59,11 +59,7 @@ class MAMPC(Controller):
         as_instance("rules", rules, MoveRules)
         every = bool(np.any(rules.min_size)) or rules.levels is not None
         super().__init__(problem, bound_every_move=every, levels=rules.levels)
-        if on_limit_violation not in ON_LIMIT_VIOLATION:
-            raise MampcError(
-                f"on_limit_violation: expected one of {', '.join(ON_LIMIT_VIOLATION)}, "
-                f"received {on_limit_violation!r}"
-            )
+        as_choice("on_limit_violation", on_limit_violation, ON_LIMIT_VIOLATION)
         margin = as_vector("violation_margin", violation_margin, problem.model.n_outputs, 0.0)
         self._margin = margin if on_limit_violation == "ignore_budget" else None
         if self._margin is not None and self.levels is not None:

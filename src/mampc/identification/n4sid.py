@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_matrix, as_whole
+from mampc.base.checks import Array, as_array, as_choice, as_matrix, as_whole
 from mampc.base.errors import MampcError
 from mampc.identification.choices import ENOUGH, Choice, block_rows_for, chosen, estimated
 from mampc.identification.closed_loop import certainly_unstable, estimate_predictor, under_feedback
@@ -134,12 +134,9 @@ def n4sid(
     Raises:
         MampcError: a record too short, constant signals, or an unstable model with unstable="refuse".
     """
-    if weighting not in WEIGHTINGS:
-        raise MampcError(f"weighting: expected one of {WEIGHTINGS}, received {weighting!r}")
-    if unstable not in ("auto", "stabilise", "refuse"):
-        raise MampcError(f"unstable: expected 'auto', 'stabilise' or 'refuse', received {unstable!r}")
-    if detrend not in DETREND:
-        raise MampcError(f"detrend: expected one of {DETREND}, received {detrend!r}")
+    as_choice("weighting", weighting, WEIGHTINGS)
+    as_choice("unstable", unstable, ("auto", "stabilise", "refuse"))
+    as_choice("detrend", detrend, DETREND)
     given = _records(data)
     first = given[0]
     m, l = first.u.shape[1], first.y.shape[1]

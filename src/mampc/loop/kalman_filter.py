@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray, as_vector, is_usable
+from mampc.base.checks import Array, BoolArray, as_choice, as_vector, is_usable
 from mampc.base.errors import MampcError
 from mampc.loop.disturbances import (
     Directions,
@@ -96,8 +96,7 @@ class KalmanFilter(Estimator):
                 states with these outputs.
         """
         as_discrete("model", model)
-        if disturbance not in ("auto", "output", "input"):
-            raise MampcError(f"disturbance: expected 'auto', 'output' or 'input', received {disturbance!r}")
+        as_choice("disturbance", disturbance, ("auto", "output", "input"))
         n, m, l = model.n_states, model.n_inputs, model.n_outputs
         if disturbance == "input" and m < l:
             raise MampcError(f"offset_free: expected at least {l} inputs for {l} outputs, received {m}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_matrix, as_number, as_one_or_each, as_vector
+from mampc.base.checks import Array, as_array, as_choice, as_matrix, as_number, as_one_or_each, as_vector
 from mampc.base.errors import MampcError, shown
 from mampc.systems.state_space import StateSpace
 
@@ -50,8 +50,7 @@ class _At:
     at: str = "input"
 
     def __post_init__(self) -> None:
-        if self.at not in PLACES:
-            raise MampcError(f"at: expected one of {', '.join(PLACES)}, received {shown(self.at)}")
+        as_choice("at", self.at, PLACES)
         for name in self._positive:
             object.__setattr__(self, name, as_number(name, getattr(self, name), 0.0, exclusive=True))
         if hasattr(self, "size"):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_instance, as_matrix, as_vector, as_whole
+from mampc.base.checks import Array, as_array, as_choice, as_instance, as_matrix, as_vector, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.base.progress import watched
@@ -339,11 +339,8 @@ def _variants(variant: str | Sequence[str] | None, T: int, controller: Controlle
         raise MampcError(
             f"variant: expected a name or one for each of {T} samples, received {shown(variant)}"
         )
-    unknown = sorted(set(names) - set(controller.variants))
-    if unknown:
-        raise MampcError(
-            f"variant: expected one of {', '.join(controller.variants)}, received {unknown[0]!r}"
-        )
+    for name in sorted(set(names)):
+        as_choice("variant", name, controller.variants)
     return names
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from mampc.base.checks import as_choice
 from mampc.base.errors import MampcError
 from mampc.methods.admm import ADMM
 from mampc.methods.alternating import Alternating
@@ -31,8 +32,7 @@ METHODS: dict[str, type] = {
 def method_of(method: str | Method, settings: Mapping[str, Any]) -> Method:
     """A method object from its name and settings, or the object itself; raises `MampcError`."""
     if isinstance(method, str):
-        if method not in METHODS:
-            raise MampcError(f"method: expected one of {', '.join(METHODS)}, received {method!r}")
+        as_choice("method", method, METHODS)
         known = [field.name for field in fields(METHODS[method])]
         unknown = sorted(set(settings) - set(known))
         if unknown:

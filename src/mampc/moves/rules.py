@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_one_or_each, as_whole
+from mampc.base.checks import Array, as_choice, as_one_or_each, as_whole
 from mampc.base.errors import MampcError
 from mampc.program.levels import as_levels
 
@@ -55,8 +55,7 @@ class MoveRules:
         if self.max_moves is not None:
             as_whole("max_moves", self.max_moves, 0)
         as_whole("sparsity_horizon", self.sparsity_horizon, 1, 10_000)
-        if not isinstance(self.counting, str) or self.counting not in COUNTINGS:
-            raise MampcError(f"counting: expected one of {COUNTINGS}, received {self.counting!r}")
+        as_choice("counting", self.counting, COUNTINGS)
         as_whole("dwell", self.dwell, 1, 10_000)
         if self.max_moves_per_step is not None:
             as_whole("max_moves_per_step", self.max_moves_per_step, 1)

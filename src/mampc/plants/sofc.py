@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_number, as_vector
+from mampc.base.checks import Array, as_array, as_choice, as_number, as_vector
 from mampc.base.errors import MampcError
 from mampc.base.names import Names
 from mampc.plants.plant import parameter
@@ -84,8 +84,7 @@ class SolidOxideFuelCell:
     )
 
     def __post_init__(self) -> None:
-        if self.variant not in H2_FRACTIONS:
-            raise MampcError(f"variant: expected one of {sorted(H2_FRACTIONS)}, received {self.variant!r}")
+        as_choice("variant", self.variant, H2_FRACTIONS)
         if self.h2_fraction is None:
             object.__setattr__(self, "h2_fraction", H2_FRACTIONS[self.variant])
         for name in (

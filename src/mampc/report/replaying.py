@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from mampc.base.checks import as_choice
 from mampc.base.errors import MampcError
 from mampc.loop.replay import Difference, Recording, replay
 from mampc.report.output import trajectories
@@ -30,10 +31,8 @@ def replay_trajectory(
     """
     files = {name: (scenario, controller) for scenario, controller, name in trajectories(study)}
     controllers = {table.name: table for table in study.controllers}
-    if controller_name is not None and controller_name not in controllers:
-        raise MampcError(
-            f"controller: expected one of {', '.join(controllers)}, received {controller_name!r}"
-        )
+    if controller_name is not None:
+        as_choice("controller", controller_name, controllers)
     if controller_name is None and path.name not in files:
         raise MampcError(
             f"replay: expected a file named one of {', '.join(files)}, received {path.name}; a live loop's needs "

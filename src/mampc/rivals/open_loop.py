@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mampc.base.checks import Array, as_vector, as_whole
+from mampc.base.checks import Array, as_choice, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.program.problem import Limits
 from mampc.systems.state_space import StateSpace
@@ -78,8 +78,7 @@ def _solved(
     from scipy.optimize import Bounds, LinearConstraint, milp
 
     n, m, N = model.n_states, model.n_inputs, as_whole("steps", steps, 1, 2000)
-    if norm not in NORMS:
-        raise MampcError(f"norm: expected one of {', '.join(NORMS)}, received {norm!r}")
+    as_choice("norm", norm, NORMS)
     x = as_vector("x0", x0, n)
     goal = as_vector("x_target", 0.0 if x_target is None else x_target, n)
     before = as_vector("u_previous", u_previous, m)

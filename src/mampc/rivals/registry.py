@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
+from mampc.base.checks import as_choice
 from mampc.base.errors import MampcError
 from mampc.controllers.controller import Controller
 from mampc.controllers.mpc import MPC
@@ -65,12 +66,9 @@ def rival(
 
 def check_settings(method: str, settings: Mapping[str, Any]) -> None:
     """Raises `MampcError` for an unknown rival, and for settings that it does not have or that are missing."""
-    if method not in RIVALS:
-        raise MampcError(f"method: expected one of {', '.join(RIVALS)}, received {method!r}")
+    as_choice("method", method, RIVALS)
     if method == "penalised":
-        name = settings.get("penalty")
-        if not isinstance(name, str) or name not in PENALTIES:
-            raise MampcError(f"penalty: expected one of {', '.join(PENALTIES)}, received {name!r}")
+        name = as_choice("penalty", settings.get("penalty"), PENALTIES)
         _require_known(f"{method}, {name}", PENALTIES[name], _apart(settings)[0])
     else:
         _require_known(method, RULES.get(method, SparseInputs), settings)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, BoolArray, as_number, as_vector, as_whole
+from mampc.base.checks import Array, BoolArray, as_choice, as_number, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.base.words import Status
 from mampc.controllers.controller import Controller
@@ -102,9 +102,7 @@ class DeadBand(Rule):
     def __init__(self, controller: Controller, *, size: Any, kind: str = "each") -> None:
         super().__init__(controller)
         self._size = as_vector("size", size, self.problem.model.n_inputs, 0.0)
-        if kind not in BANDS:
-            raise MampcError(f"kind: expected one of {', '.join(BANDS)}, received {kind!r}")
-        self.kind = kind
+        self.kind = as_choice("kind", kind, BANDS)
 
     def chosen(self, wanted: Array, u: Array) -> Array:
         change, size = np.abs(wanted - u), self._size
