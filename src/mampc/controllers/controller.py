@@ -343,8 +343,11 @@ class Controller(ABC):
             violations = self._no_violations
         # What is handed out is also what is remembered.
         u, history = inputs.applied(planned), state.inputs
-        history = u[None] if len(history) == 1 else np.concatenate((history[1:], u[None]))
-        history.setflags(write=False)
+        if len(history) == 1:
+            history = u[None]
+        else:
+            history = np.concatenate((history[1:], u[None]))
+            history.setflags(write=False)
         return Decision(
             u, planned, changes, plan.status, objective, lower_bound, plan.iterations, perf_counter() - start,
             ControllerState(history, state.samples + 1, plan.guess, plan.active, plan.memory), plan.remarks, violations,

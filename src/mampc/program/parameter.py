@@ -19,6 +19,8 @@ from mampc.program.problem import TrackingProblem
 from mampc.program.sample import Indices
 from mampc.program.zone import Zone, ZoneEnds
 
+_ONE = np.ones(1)
+
 
 class Parameter:
     """Where each quantity stands in p, for a previewed reference.
@@ -67,10 +69,7 @@ class Parameter:
             np.concatenate([model.y_op, *[model.y_op[zoned]] * len(more)]), samples
         )
         self.origin = {len(of): of for of in (origin, origin[: self.reference.start + width])}
-        usual = np.zeros(self.size)  # no disturbances, and the measured ones of the operating point
-        usual[self.measured_disturbance], usual[self.one] = model.v_op, 1.0
-        self._usual = {len(at): usual[: len(at)] for at in self.origin.values()}
-        self._sizes = {"d_u": (m,), "d_y": (l,), "v": (len(model.v_op),)}
+        self._usual = np.zeros(m), np.zeros(l), model.v_op  # no disturbances, and those of the operating point
 
     def vector(
         self,
@@ -89,23 +88,15 @@ class Parameter:
             reference = self.with_ends(reference)
         if reference.ndim == 2:
             reference = reference.ravel()
-        start, sizes = self.reference.start, self._sizes
-        size = start + len(reference)
-        vector = self._usual[size].copy()
-        vector[self.x] = x
-        vector[self.u_previous] = vector[self.u_deviation] = u_previous
-        vector[start:] = reference
+        d_u, d_y, v = self._usual
         if input_disturbance is not None:
-            vector[self.input_disturbance] = as_shaped("input_disturbance", input_disturbance, sizes["d_u"])
+            d_u = as_shaped("input_disturbance", input_disturbance, d_u.shape)
         if output_disturbance is not None:
-            vector[self.output_disturbance] = as_shaped(
-                "output_disturbance", output_disturbance, sizes["d_y"]
-            )
+            d_y = as_shaped("output_disturbance", output_disturbance, d_y.shape)
         if measured_disturbance is not None:
-            vector[self.measured_disturbance] = as_shaped(
-                "measured_disturbance", measured_disturbance, sizes["v"]
-            )
-        vector -= self.origin[size]
+            v = as_shaped("measured_disturbance", measured_disturbance, v.shape)
+        vector = np.concatenate((x, u_previous, u_previous, d_u, d_y, v, _ONE, reference))
+        vector -= self.origin[len(vector)]
         return vector
 
     def with_ends(self, reference: Array) -> Array:
