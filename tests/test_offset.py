@@ -122,7 +122,7 @@ def test_plans_that_wait_for_later_data_leave_no_more_than_the_regulator_says(se
     state, planner = regulator.initial_state(), regulator._planner
     likely, scale = 0.9 * np.eye(6)[0] + 0.1 * rng.dirichlet(np.ones(6)), 10 ** rng.uniform(-1, 1)
     estimate, weights = replace(state.estimate, weights=likely, scale=np.array([scale, 1.0])), likely * scale
-    bound = regulator.largest_offset(replace(state, estimate=estimate))
+    bound = regulator.largest_offset(state._replace(estimate=estimate))
     assert (bound >= mampc.largest_offset(problem, mampc.MoveRules(price=price)) * (1 - 1e-9)).all()
     for size in (5.0, 1.05, 0.8, 0.4):
         reference = model.y_op + size * bound * rng.choice([-1, 1], model.n_outputs)

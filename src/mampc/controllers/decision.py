@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
+from mampc.base.identity import equal_only_to_itself
 from mampc.base.words import Fault, LoadKind, Remark, Status
 
 
+@equal_only_to_itself
 class ControllerState(NamedTuple):
     """What a controller remembers: plain numbers, safe to copy and pickle. Equal only to itself.
 
@@ -29,16 +31,8 @@ class ControllerState(NamedTuple):
     active: Array | None = None
     memory: Array | None = None
 
-    def __eq__(self, other: object) -> bool:
-        return self is other
 
-    def __ne__(self, other: object) -> bool:
-        return self is not other
-
-    def __hash__(self) -> int:
-        return id(self)
-
-
+@equal_only_to_itself
 class Decision(NamedTuple):
     """One sample's decision, in engineering units; its arrays are read-only. Equal only to itself.
 
@@ -99,15 +93,6 @@ class Decision(NamedTuple):
     def held(self) -> bool:
         """True when nothing could be planned and the previous inputs are held."""
         return self.status.held
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
-    def __ne__(self, other: object) -> bool:
-        return self is not other
-
-    def __hash__(self) -> int:
-        return id(self)
 
     def __repr__(self) -> str:
         words = [f"u={np.array2string(self.u, precision=6, threshold=8)}", str(self.status)]

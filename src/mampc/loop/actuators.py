@@ -11,11 +11,12 @@ in manual. Unless reported inputs *changed* as decided ones did. Then the actuat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from mampc.base.checks import LARGEST, Array, BoolArray
+from mampc.base.identity import equal_only_to_itself
 from mampc.program.problem import Limits
 
 TOLERANCE = 0.01  # of the range of an input: neither valves nor their position feedback are more exact
@@ -25,8 +26,8 @@ ABSURD = 100.0  # times the range of an input: no actuator is that far outside
 LATEST = 10  # samples that an actuator may be late by
 
 
-@dataclass(frozen=True, eq=False)
-class ActuatorState:
+@equal_only_to_itself
+class ActuatorState(NamedTuple):
     """What is remembered of the actuators.
 
     Attributes:
@@ -97,7 +98,7 @@ class Actuators:
         stays = np.abs(reported - state.reported) <= tolerance
         careful = None if manual is None and not state.manual.any() else state.manual != 0
         if careful is None and (agrees & stays).all():  # the everyday case, at once
-            return inputs, replace(state, reported=reported.copy())
+            return inputs, state._replace(reported=reported.copy())
         known = (reported > self._low) & (reported < self._high)
         inputs, late, offset, commands = inputs.copy(), late.copy(), offset.copy(), np.array(state.commands)
         kept = min(len(inputs), len(commands))

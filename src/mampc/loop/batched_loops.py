@@ -147,8 +147,8 @@ class BatchedLoops:
         before = [self._state(s, k) for s in one_by_one]
         self._tracked = tracked
         self._inputs = np.concatenate([self._inputs[:, 1:], first[:, None]], axis=1)
-        everywhere = {"blind": np.zeros(len(y), dtype=int)}
-        self._estimate, self._sensors, self._v_last = estimate, SensorState(**vars(after) | everywhere), told
+        never: Any = np.zeros(len(y), dtype=int)
+        self._estimate, self._sensors, self._v_last = estimate, after._replace(blind=never), told
         if one_by_one:  # these arrays are written to, and some are shared
             self._estimate, self._sensors = _copied(self._estimate), _copied(self._sensors)
             self._v_last = told.copy()
@@ -162,7 +162,7 @@ class BatchedLoops:
 
     def _state(self, s: int, k: int) -> RegulatorState:
         """What the regulator of one loop remembers."""
-        sensors: dict[str, Any] = {name: part[s].copy() for name, part in vars(self._sensors).items()}
+        sensors: dict[str, Any] = {name: part[s].copy() for name, part in self._sensors._asdict().items()}
         return RegulatorState(
             ControllerState(self._inputs[s].copy(), k, None, self._active[s]),
             type(self._estimate)(**{name: part[s].copy() for name, part in vars(self._estimate).items()}),
@@ -177,7 +177,7 @@ class BatchedLoops:
         state = decision.state
         self._inputs[s], self._active[s] = state.controller.inputs, state.controller.active
         for stack, own in ((self._estimate, state.estimate), (self._sensors, state.sensors)):
-            for name, value in vars(own).items():
+            for name, value in _named(own).items():
                 getattr(stack, name)[s] = value
         self._v_last[s] = state.measured_disturbance
         if self._tracked is not None:
@@ -185,8 +185,13 @@ class BatchedLoops:
 
 
 def _copied(stack: Any) -> Any:
-    return type(stack)(**{name: part.copy() for name, part in vars(stack).items()})
+    return type(stack)(**{name: part.copy() for name, part in _named(stack).items()})
 
 
 def _stacked(kind: Any, parts: list[Any]) -> Any:
-    return kind(**{name: np.array([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+    return kind(**{name: np.array([getattr(part, name) for part in parts]) for name in _named(parts[0])})
+
+
+def _named(held: Any) -> dict[str, Any]:
+    """What an estimate or the sensors' state hold, by name."""
+    return held._asdict() if isinstance(held, SensorState) else vars(held)

@@ -29,6 +29,7 @@ import numpy as np
 
 from mampc.base.checks import LARGEST, Array, BoolArray, as_array, as_limit, as_vector, as_whole
 from mampc.base.errors import MampcError
+from mampc.base.identity import equal_only_to_itself
 from mampc.base.words import Fault
 from mampc.program.problem import TrackingProblem
 
@@ -90,8 +91,8 @@ class SensorChecks:
         return Sensors(self, problem, noise)
 
 
-@dataclass(frozen=True, eq=False)
-class SensorState:
+@equal_only_to_itself
+class SensorState(NamedTuple):
     """What the checks remember of each output, arrays of shape (l,).
 
     Attributes:
@@ -150,7 +151,7 @@ class Sensors:
             noise = problem.model.noise.output
         if noise is not None:
             self._jump = np.maximum(self._jump, JUMP_OF_NOISE * noise)
-        learns = checks.largest_jump is None and not settles
+        self._learns = checks.largest_jump is None and not settles
         if checks.largest_jump is not None:
             self._jump = _largest_jump(checks.largest_jump, l)
         self._absurd, self._y_op = ABSURD_OF_REACH * reach, problem.model.y_op
@@ -159,13 +160,14 @@ class Sensors:
         self._coarse_step = COARSE_STEP * self._jump
         self._coarse = self._coarse_step.tolist()
         self._bounds = np.stack([self._jump, self._low, self._high], axis=1).tolist()
-        self._small_surprise = SMALL_SURPRISE * self._jump if learns else np.full(l, np.inf)
+        self._small_surprise = SMALL_SURPRISE * self._jump if self._learns else np.full(l, np.inf)
         self._small = self._small_surprise.tolist()
         self._forgotten = self._small_surprise / JUMP_OF_SURPRISE  # no largest jump comes of it
         self._confirm = checks.confirm
         self._stuck_after = np.inf if checks.stuck_after is None else checks.stuck_after
         self._names = problem.model.names.outputs
         self._all, self._none, self._zeros = np.ones(l, dtype=bool), np.zeros(l, dtype=bool), np.zeros(l)
+        self._column = np.ones((l, 1))
         self._fine = Judged(self._all, {}, self._none)
 
     def initial(self, loads: Array) -> SensorState:
@@ -221,10 +223,11 @@ class Sensors:
 
     def _is_fine(self, state: SensorState, y: Array, innovation: Array) -> bool:
         """Whether every number is new, in range and near its prediction; in plain floats, which few are quicker in."""
-        pairs = zip(y.tolist(), state.y.tolist(), innovation.tolist(), self._bounds, strict=True)
-        return all(
-            now != last and -jump <= e <= jump and a <= now <= b for now, last, e, (jump, a, b) in pairs
-        )
+        each = zip(y.tolist(), state.y.tolist(), innovation.tolist(), self._bounds, strict=True)
+        for now, last, e, (jump, low, high) in each:
+            if not (now != last and -jump <= e <= jump and low <= now <= high):
+                return False
+        return True
 
     def are_fine(self, state: SensorState, y: Array, innovation: Array) -> BoolArray:
         """The same of many loops, whose arrays have these first, shape (S,)."""
@@ -241,8 +244,9 @@ class Sensors:
 
     def _surprise(self, surprise: Array, innovation: Array, came: BoolArray) -> Array:
         """The usual distance from the prediction with this sample, shape (l,), or of many loops."""
-        if surprise is self._zeros and all(
-            -small <= e <= small for e, small in zip(innovation.tolist(), self._small, strict=True)
+        if surprise is self._zeros and (
+            not self._learns
+            or all(-small <= e <= small for e, small in zip(innovation.tolist(), self._small, strict=True))
         ):
             return surprise
         counted = np.minimum(np.abs(innovation), np.maximum(self._jump, JUMP_OF_SURPRISE * surprise))
@@ -253,7 +257,8 @@ class Sensors:
 
     def _each(self, loads: Array) -> Array:
         """The loads (k,) once for every output, shape (l, k), of one loop or of many."""
-        return loads[..., None, :].repeat(len(self._zeros), axis=-2)
+        each: Array = loads[..., None, :] * self._column
+        return each
 
     def _is_stuck(self, state: SensorState, repeats: Array, moved: Array) -> BoolArray:
         """The outputs that have shown the same for too long, though the model moved them, shape (l,)."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mampc.base.checks import Array, as_whole
 from mampc.base.errors import MampcError, shown
+from mampc.base.identity import equal_only_to_itself
 from mampc.controllers.decision import ControllerState
 from mampc.loop.actuators import ActuatorState
 from mampc.loop.estimator import Estimate
@@ -19,8 +19,8 @@ from mampc.loop.sensors import SensorState
 FORMAT = "mampc-regulator-state-1"
 
 
-@dataclass(frozen=True, eq=False)
-class RegulatorState:
+@equal_only_to_itself
+class RegulatorState(NamedTuple):
     """What a regulator remembers between samples; plain numbers, which JSON carries to the last bit.
 
     Attributes:
@@ -45,10 +45,14 @@ class RegulatorState:
 
     def to_json(self) -> str:
         """The state as JSON text; `Regulator.state_from_json` gives the same numbers back."""
-        return json.dumps(
-            {"format": FORMAT, **asdict(self), "controller": self.controller._asdict()},
-            default=np.ndarray.tolist,
-        )
+        return json.dumps({"format": FORMAT, **self._asdict(), **self._parts()}, default=np.ndarray.tolist)
+
+    def _parts(self) -> dict[str, dict[str, Any]]:
+        """What each part remembers, by name."""
+        return {
+            "controller": self.controller._asdict(), "estimate": vars(self.estimate),
+            "sensors": self.sensors._asdict(), "actuators": self.actuators._asdict(),
+        }  # fmt: skip
 
     @classmethod
     def from_json(cls, text: str) -> RegulatorState:
@@ -76,14 +80,9 @@ class RegulatorState:
 
     def shapes(self) -> dict[str, tuple[int, ...] | None]:
         """The shape of every array, by its place; None where there is none."""
-        parts = {
-            "estimate": self.estimate, "sensors": self.sensors,
-            "actuators": self.actuators,
-        }  # fmt: skip
         places = {
-            f"{part}.{name}": value for part, held in parts.items() for name, value in vars(held).items()
+            f"{part}.{name}": value for part, held in self._parts().items() for name, value in held.items()
         }
-        places |= {f"controller.{name}": value for name, value in self.controller._asdict().items()}
         places["measured_disturbance"] = self.measured_disturbance
         places["reference"], places["command"] = self.reference, self.command
         return {place: None if value is None else np.shape(value) for place, value in places.items()}

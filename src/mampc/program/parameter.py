@@ -69,7 +69,8 @@ class Parameter:
             np.concatenate([model.y_op, *[model.y_op[zoned]] * len(more)]), samples
         )
         self.origin = {len(of): of for of in (origin, origin[: self.reference.start + width])}
-        self._usual = np.zeros(m), np.zeros(l), model.v_op  # no disturbances, and those of the operating point
+        # No disturbances, and the measured ones of the operating point.
+        self._usual: tuple[Array, Array, Array] = np.zeros(m), np.zeros(l), model.v_op
 
     def vector(
         self,
