@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,16 +86,13 @@ def simulate(
     return closed_loop(plant, regulator, course, preview=preview, progress=progress)
 
 
-@dataclass(frozen=True, eq=False)
-class Course:
-    """What acts on a loop of T samples from outside.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Given:
+    """What acts on a loop of T samples from outside and is not drawn.
 
     Attributes:
         reference: as long as it is predicted, shape (T + np, l).
         zone: asked for in place of the reference, its ends of the same shape; None where none is.
-        noise: of the measurements, shape (T, l).
-        at_inputs, at_outputs: unmeasured disturbances, shapes (T, m) and (T, l).
-        v: measured disturbances, shape (T, d).
         u_initial: inputs before the first sample, shape (m,).
         stems: the valves at these inputs; None where inputs are as decided.
         variants: of a `ControllerBank`, a name for each sample; None for its first.
@@ -104,14 +101,26 @@ class Course:
 
     reference: Array
     zone: Zone | None
-    noise: Array
-    at_inputs: Array
-    at_outputs: Array
-    v: Array
     u_initial: Array
     stems: Stems | None
     variants: Sequence[str] | None
     interventions: Interventions | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Course(Given):
+    """What acts on a loop of T samples from outside.
+
+    Attributes:
+        noise: of the measurements, shape (T, l).
+        at_inputs, at_outputs: unmeasured disturbances, shapes (T, m) and (T, l).
+        v: measured disturbances, shape (T, d).
+    """
+
+    noise: Array
+    at_inputs: Array
+    at_outputs: Array
+    v: Array
 
     def asked(self, k: int, samples: int | None) -> Array | Zone:
         """What the regulator is asked for at sample k: of this one, or of so many from it on where it sees ahead."""
@@ -151,28 +160,21 @@ class Course:
         return len(self.noise)
 
 
-@dataclass(frozen=True, eq=False)
-class Acting:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Acting(Given):
     """What acts on a loop of T samples from outside, before anything random in it is drawn.
 
     Attributes:
         dt: sample time in seconds.
-        reference, zone, u_initial, stems, variants, interventions: as in `Course`.
         spread: standard deviation of the noise, shape (l,).
         at: disturbances by place, shapes (T, m), (T, l) and (T, d).
         loads: to be drawn.
     """
 
     dt: float
-    reference: Array
-    zone: Zone | None
     spread: Array
     at: dict[str, Array]
     loads: Sequence[Load]
-    u_initial: Array
-    stems: Stems | None
-    variants: Sequence[str] | None
-    interventions: Interventions | None
 
     def drawn(self, seed: int) -> Course:
         """With noise and loads of a seed."""
@@ -184,18 +186,8 @@ class Acting:
         for place, load in drawn(self.loads, T, self.dt, seed, signals):
             at[place] = at[place] + load
         noise = self.spread * np.random.default_rng(seed).standard_normal((T, len(self.spread)))
-        return Course(
-            self.reference,
-            self.zone,
-            noise,
-            at["input"],
-            at["output"],
-            at["measured"],
-            self.u_initial,
-            self.stems,
-            self.variants,
-            self.interventions,
-        )
+        same = {one.name: getattr(self, one.name) for one in fields(Given)}
+        return Course(noise=noise, at_inputs=at["input"], at_outputs=at["output"], v=at["measured"], **same)
 
 
 def acting_on(
