@@ -59,6 +59,12 @@ def calls(v):
     yield "validate", lambda: mampc.validate(MODEL, v)
     yield "validate model", lambda: mampc.validate(v, DATA)
     yield "excite", lambda: mampc.excite(MODEL, v, dt=1.0)
+    yield "excite plant", lambda: mampc.excite(v, [[1.0]], dt=1.0)
+    for k in ("noise", "evidence", "names"):
+        yield f"StateSpace {k}", lambda k=k: mampc.StateSpace([[0.5]], [[1]], [[1]], None, 1.0, **{k: v})
+    yield "Noise", lambda: mampc.Noise(v, v)
+    for k in ("inputs", "outputs", "states", "disturbances"):
+        yield f"Names {k}", lambda k=k: mampc.Names(**({"inputs": ("u",), "outputs": ("y",)} | {k: v}))
     for k in (
         "gain",
         "settling_time",
@@ -75,13 +81,15 @@ def calls(v):
             lambda k=k: mampc.plan_test(**({"gain": 2.0, "settling_time": 60.0, "noise": 0.1} | {k: v})),
         )
     yield "linearise", lambda: mampc.linearise(v)
+    yield "linearise u", lambda: mampc.linearise(mampc.plants.Level(), v)
+    yield "steps", lambda: mampc.steps(3, 0.0, v)
     yield "prbs", lambda: mampc.prbs(order=v, amplitude=1.0)
     yield "prbs amplitude", lambda: mampc.prbs(order=4, amplitude=v)
     yield "simulate plant", lambda: mampc.simulate(v, REGULATOR, [1.0], steps=3)
     yield "simulate regulator", lambda: mampc.simulate(MODEL, v, [1.0], steps=3)
     yield "simulate a controller", lambda: mampc.simulate(MODEL, MPC, [1.0], steps=3)
     yield "simulate reference", lambda: mampc.simulate(MODEL, REGULATOR, v, steps=3)
-    for k in ("steps", "noise", "seed", "input_disturbance", "loads", "valves", "u_initial"):
+    for k in ("steps", "noise", "seed", "input_disturbance", "loads", "valves", "u_initial", "preview"):
         yield f"simulate {k}", lambda k=k: mampc.simulate(MODEL, REGULATOR, [1.0], **({"steps": 3} | {k: v}))
     yield "simulate_batch", lambda: mampc.simulate_batch(MODEL, REGULATOR, [1.0], steps=3, seeds=v)
     yield "step x", lambda: MPC.step(MPC.initial_state(), v, [1.0])
@@ -109,6 +117,7 @@ def calls(v):
                 lambda name=name, k=k: rivals.Penalised(PROBLEM, penalty=getattr(rivals, name)(**{k: v})),
             )
     yield "minimum_attention", lambda: rivals.minimum_attention(MODEL, v, steps=3)
+    yield "minimum_attention model", lambda: rivals.minimum_attention(v, [1.0], steps=3)
     yield "minimum_attention steps", lambda: rivals.minimum_attention(MODEL, [1.0], steps=v)
 
 
@@ -125,3 +134,16 @@ def test_no_other_error_leaves_a_public_function(value):
             except Exception as error:
                 wrong.append(f"{name}: {type(error).__name__}: {error}")
     assert not wrong
+
+
+def test_a_plant_that_lacks_something_is_told_what():
+    class Half:
+        names = mampc.Names(("u",), ("y",))
+
+    for plant in (Half(), mampc.plants.QuadrupleTank):
+        with pytest.raises(mampc.MampcError, match=r"without (derivative, output, steady_state|an object)"):
+            mampc.simulate(plant, REGULATOR, [1.0], steps=3)
+    with pytest.raises(mampc.MampcError, match="expected a tuple of words, received 'level'"):
+        mampc.Names(("u",), "level")
+    with pytest.raises(mampc.MampcError, match="expected a nonlinear plant"):
+        mampc.linearise(MODEL)

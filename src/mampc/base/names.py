@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, shown
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,10 @@ class Names:
 
     def __post_init__(self) -> None:
         for kind in ("inputs", "outputs", "states", "disturbances"):
-            names = tuple(getattr(self, kind))
+            given = getattr(self, kind)
+            if isinstance(given, str) or not isinstance(given, Iterable):
+                raise MampcError(f"names.{kind}: expected a tuple of words, received {shown(given)}")
+            names = tuple(given)
             if any(not isinstance(name, str) or not name for name in names):
                 raise MampcError(f"names.{kind}: expected non-empty words, received {names!r}")
             if len(set(names)) != len(names):

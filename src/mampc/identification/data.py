@@ -14,7 +14,7 @@ from mampc.base.checks import Array, as_array, as_matrix, as_number, as_vector, 
 from mampc.base.errors import MampcError
 from mampc.base.files import written_whole
 from mampc.base.names import Names, require_count
-from mampc.plants import Plant, advance, state_sizes
+from mampc.plants import Plant, advance, require_plant, state_sizes
 from mampc.systems.state_space import StateSpace
 
 if TYPE_CHECKING:
@@ -163,6 +163,8 @@ def excite(
                 f"excite: expected a discrete model and its dt, received {plant.dt:g} s and dt={dt}"
             )
         dt = plant.dt
+    else:
+        require_plant(plant)
     dt = as_number("dt", dt, 0.0, exclusive=True)
     names, l = plant.names, len(plant.names.outputs)
     signal = _column("u", u)

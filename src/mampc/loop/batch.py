@@ -145,6 +145,7 @@ def simulate_batch(
     seeds = tuple(as_whole("seeds", seed, 0) for seed in seeds)
     if not seeds:
         raise MampcError("seeds: expected at least one, received none")
+    preview = as_flag("preview", preview)
     plants = list(plant) if isinstance(plant, Sequence) else [plant] * len(seeds)
     if len(plants) != len(seeds):
         raise MampcError(

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_choice, as_instance, as_matrix, as_vector, as_whole
+from mampc.base.checks import Array, as_array, as_choice, as_flag, as_instance, as_matrix, as_vector, as_whole
 from mampc.base.errors import MampcError, shown
-from mampc.base.names import Names
 from mampc.base.progress import watched
 from mampc.controllers.bank import ControllerBank
 from mampc.controllers.controller import Controller
@@ -20,7 +19,7 @@ from mampc.loop.regulator import Regulator
 from mampc.loop.run import Run
 from mampc.loop.state import RegulatorState
 from mampc.loop.valves import Stems, Valves
-from mampc.plants import Plant
+from mampc.plants import Plant, require_plant
 from mampc.program.problem import Limits
 from mampc.program.zone import Zone
 from mampc.systems.state_space import StateSpace
@@ -83,7 +82,7 @@ def simulate(
         measured_disturbance=measured_disturbance, loads=loads, valves=valves, u_initial=u_initial,
         variant=variant, limits=limits, manual=manual,
     ).drawn(seed)  # fmt: skip
-    return closed_loop(plant, regulator, course, preview=preview, progress=progress)
+    return closed_loop(plant, regulator, course, preview=as_flag("preview", preview), progress=progress)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,8 +208,8 @@ def acting_on(
 ) -> Acting:
     """What the arguments of `simulate` say, checked."""
     as_instance("regulator", regulator, Regulator)
-    if not isinstance(getattr(plant, "names", None), Names):
-        raise MampcError(f"plant: expected a plant or a mampc.StateSpace, received {shown(plant)}")
+    if not isinstance(plant, StateSpace):
+        require_plant(plant)
     model = regulator.controller.problem.model
     m, l, d = model.n_inputs, model.n_outputs, len(plant.names.disturbances)
     if (len(plant.names.inputs), len(plant.names.outputs)) != (m, l) or model.n_disturbances not in (0, d):

@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from mampc.plants.integration import advance, state_sizes
-from mampc.plants.plant import Plant
+from mampc.plants.plant import Plant, require_plant
 
 if TYPE_CHECKING:
     from mampc.plants.columns import ogunnaike_ray, wood_berry
@@ -26,6 +26,7 @@ __all__ = [
     "VanDeVusse",
     "advance",
     "ogunnaike_ray",
+    "require_plant",
     "state_sizes",
     "wood_berry",
 ]

@@ -6,7 +6,10 @@ from dataclasses import field
 from typing import Any, Protocol, runtime_checkable
 
 from mampc.base.checks import Array
+from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
+
+MEMBERS = ("names", "derivative", "output", "steady_state")
 
 
 @runtime_checkable
@@ -36,6 +39,22 @@ class Plant(Protocol):
     def steady_state(self, u: Any = None) -> Array:
         """The state at rest under constant inputs, shape (..., n); `MampcError` where there is none."""
         ...
+
+
+def missing_of(plant: Any) -> str:
+    """What a plant lacks, in words; nothing where it is one."""
+    missing = [member for member in MEMBERS if not hasattr(plant, member)]
+    if isinstance(plant, type):
+        return "an object made of it"
+    return ", ".join(missing) or ("" if isinstance(plant.names, Names) else "names that are a mampc.Names")
+
+
+def require_plant(plant: Any) -> None:
+    """Raise `MampcError` for anything but a nonlinear plant."""
+    if missing := missing_of(plant):
+        raise MampcError(
+            f"plant: expected a plant or a mampc.StateSpace, received {shown(plant)} without {missing}"
+        )
 
 
 def parameter(default: Any, unit: str, source: str) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from mampc.base.checks import Array, as_choice, as_vector, as_whole
 from mampc.base.errors import MampcError
 from mampc.program.problem import Limits
-from mampc.systems.state_space import StateSpace
+from mampc.systems.state_space import StateSpace, as_discrete
 
 NORMS = ("l1", "l0")
 ZERO = 1e-9  # of the largest input or move: smaller ones are none
@@ -77,6 +77,7 @@ def _solved(
 ) -> OpenLoopPlan:  # fmt: skip
     from scipy.optimize import Bounds, LinearConstraint, milp
 
+    as_discrete("model", model)
     n, m, N = model.n_states, model.n_inputs, as_whole("steps", steps, 1, 2000)
     as_choice("norm", norm, NORMS)
     x = as_vector("x0", x0, n)

@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 
 from mampc.base.errors import MampcError, StudyError
-from mampc.base.names import Names
 from mampc.plants import Plant
+from mampc.plants.plant import MEMBERS, missing_of
 from mampc.study.schema import PLANTS, SAMPLED, Study
 from mampc.systems.state_space import StateSpace
-
-MEMBERS = ("names", "derivative", "output", "steady_state")
 
 
 def make_plant(study: Study) -> Plant | StateSpace:
@@ -34,7 +32,7 @@ def make_plant(study: Study) -> Plant | StateSpace:
     sampled = {"dt": study.dt} if kind in SAMPLED else {}
     try:
         plant: Plant | StateSpace = maker(**study.plant.parameters, **sampled)
-        missing = [member for member in MEMBERS if not hasattr(plant, member)]
+        missing = missing_of(plant)
     except TypeError as error:
         raise StudyError(f"plant.parameters: expected parameters of {kind}, received: {error}") from None
     except MampcError as error:
@@ -45,10 +43,10 @@ def make_plant(study: Study) -> Plant | StateSpace:
         if not np.isclose(plant.dt, study.dt, rtol=1e-6):
             raise StudyError(f"dt: expected the {plant.dt:g} s of the plant {kind}, received {study.dt:g} s")
         return plant
-    if missing or not isinstance(plant.names, Names):
+    if missing:
         raise StudyError(
             f"plant.kind: expected a class with members {', '.join(MEMBERS)} (names a mampc.Names), "
-            f"received {kind} without {', '.join(missing) or 'such names'}"
+            f"received {kind} without {missing}"
         )
     return plant
 

@@ -7,8 +7,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array
-from mampc.base.errors import MampcError
+from mampc.base.checks import Array, as_array, require_finite
+from mampc.base.errors import MampcError, shown
 from mampc.base.names import Names
 from mampc.systems.state_space import StateSpace
 
@@ -34,10 +34,15 @@ def linearise(plant: Differentiable, u: Any = None) -> StateSpace:
             disturbances) are used if it has them.
         u: inputs at the operating point, shape (m,) or (m + d,); default the plant's.
     """
+    if not all(hasattr(plant, member) for member in ("derivative", "output", "steady_state")):
+        raise MampcError(f"linearise: expected a nonlinear plant, received {shown(plant)}")
     given = getattr(plant, "u_op", None) if u is None else u
     if given is None:
         raise MampcError(f"linearise: expected inputs u, since {type(plant).__name__} has no u_op")
-    inputs = as_array("u", given)
+    inputs = np.atleast_1d(as_array("u", given))
+    require_finite("u", inputs)
+    if inputs.ndim != 1:
+        raise MampcError(f"u: expected values of shape (m,), received shape {inputs.shape}")
     names: Names | None = getattr(plant, "names", None)
     m = len(inputs) if names is None else len(names.inputs)
     if names is not None and len(inputs) == m:

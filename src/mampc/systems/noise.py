@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from mampc.base.checks import Array, as_vector
+from mampc.base.checks import Array, as_array, as_vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +27,7 @@ class Noise:
     drift: Array
 
     def __post_init__(self) -> None:
-        size = np.size(self.output)
+        size = as_array("noise.output", self.output).size
         for name in ("output", "drift"):
             value: Any = as_vector(f"noise.{name}", getattr(self, name), size, 0.0)
             value.flags.writeable = False

@@ -10,6 +10,8 @@ import numpy as np
 from mampc.base.checks import Array, as_array, as_vector, as_whole
 from mampc.base.errors import MampcError
 
+LONGEST = 100_000_000  # samples
+
 
 def prbs(
     *,
@@ -45,12 +47,12 @@ def prbs(
     """
     from scipy.signal import max_len_seq
 
-    order, hold = as_whole("order", order, 2, 20), as_whole("hold", hold, 1)
+    order, hold = as_whole("order", order, 2, 20), as_whole("hold", hold, 1, LONGEST)
     if inputs is None:
         inputs = max(as_array("amplitude", amplitude).size, as_array("mean", mean).size)
     inputs = as_whole("inputs", inputs, 1, 2**order - 1)
     period = 2**order - 1
-    samples = period * hold if samples is None else as_whole("samples", samples, 1)
+    samples = as_whole("samples", period * hold if samples is None else samples, 1, LONGEST)
     levels, middle = as_vector("amplitude", amplitude, inputs), as_vector("mean", mean, inputs)
     first = np.random.default_rng(as_whole("seed", seed, 0)).integers(period)
     bits = max_len_seq(order)[0].astype(np.float64)  # int8 would overflow when scaled
@@ -76,10 +78,10 @@ def steps(samples: int, initial: Any, changes: Sequence[tuple[int, Any]]) -> Arr
         MampcError: values of different lengths or a sample below zero.
     """
     start = np.atleast_1d(as_array("initial", initial))
-    signal = np.tile(start, (as_whole("samples", samples, 1), 1))
+    signal = np.tile(start, (as_whole("samples", samples, 1, LONGEST), 1))
     try:
         pairs = [(as_whole("changes", at, 0), value) for at, value in changes]
-    except TypeError:
+    except (TypeError, ValueError):
         raise MampcError(f"changes: expected pairs (sample, values), received {changes!r}") from None
     for at, value in sorted(pairs, key=lambda change: change[0]):
         values = as_array("changes", value)

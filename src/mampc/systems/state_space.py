@@ -95,7 +95,9 @@ class StateSpace:
         }  # fmt: skip
         if self.noise is not None and as_instance("noise", self.noise, Noise).output.shape != (l,):
             raise MampcError(f"noise: expected {l} outputs, received {self.noise.output.size}")
-        if self.evidence is not None and not self.evidence.matches(l, columns):
+        if self.evidence is not None and not as_instance("evidence", self.evidence, Evidence).matches(
+            l, columns
+        ):
             raise MampcError(f"evidence: expected {columns} inputs and {l} outputs, received other numbers")
         for name, value in checked.items():
             if isinstance(value, np.ndarray):
