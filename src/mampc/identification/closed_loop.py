@@ -19,6 +19,7 @@ from mampc.identification.parts import Part
 from mampc.identification.scaling import Scaled
 from mampc.identification.simulation_error import Trend, fit_inputs, residuals, states
 from mampc.identification.triangular import fold, solve
+from mampc.identification.uncertainty import jackknife
 
 PAST = 20  # coefficients of every signal, at most
 FEEDBACK = 5.0  # standard deviations by which past outputs must explain inputs better than chance
@@ -80,11 +81,12 @@ def certainly_unstable(records: Scaled, feedthrough: bool, order: int | None) ->
     size = np.abs(np.linalg.eigvals(A)).max()
     if size <= 1.0:
         return False
-    sizes = []
-    for left_out in range(SEGMENTS):
-        rest = _without(records, left_out)
-        sizes.append(np.abs(np.linalg.eigvals(_dynamics(rest, feedthrough, n)[0])).max())
-    spread = np.sqrt((SEGMENTS - 1) / SEGMENTS * np.sum((np.array(sizes) - np.mean(sizes)) ** 2))
+
+    def largest(rest: Scaled) -> Array:
+        poles = np.linalg.eigvals(_dynamics(rest, feedthrough, n)[0])
+        return np.array([np.abs(poles).max()])
+
+    spread = jackknife(records, SEGMENTS, largest, lambda done: None)[0]
     return bool(size - 1.0 > OUTSIDE * spread)
 
 
@@ -187,15 +189,3 @@ def _regression(
         reduced = fold(np.empty((0, rows.shape[1])), rows)[1:, 1:]
         factor = fold(factor if factor.size else np.empty((0, reduced.shape[1])), reduced)
     return factor
-
-
-def _without(records: Scaled, left_out: int) -> Scaled:
-    """The records without one of the segments of each."""
-    u: list[Array] = []
-    y: list[Array] = []
-    for inputs, outputs in zip(records.u, records.y, strict=True):
-        cuts = [round(k * len(inputs) / SEGMENTS) for k in (left_out, left_out + 1)]
-        for side in (slice(0, cuts[0]), slice(cuts[1], None)):
-            u.append(inputs[side])
-            y.append(outputs[side])
-    return records.replaced(u, y)

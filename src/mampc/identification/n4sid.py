@@ -224,7 +224,7 @@ def _keeps_unstable(records: Scaled, settings: Settings) -> bool:
     """Whether a record under feedback shows poles outside the unit circle for certain."""
     try:
         return certainly_unstable(records.shortened(ENOUGH), settings.feedthrough, settings.order)
-    except np.linalg.LinAlgError:
+    except (MampcError, np.linalg.LinAlgError):
         return False
 
 

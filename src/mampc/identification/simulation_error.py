@@ -105,23 +105,14 @@ def _rows(
     A: Array, C: Array, u: Array, y: Array, feedthrough: bool, degree: int, directions: Array, drives: int
 ) -> Iterator[Array]:
     """Blocks of equations: x0, polynomial, drive, B, D, and the right-hand side; l rows per sample."""
-    (l, n), (N, m) = C.shape, u.shape
+    N, m = u.shape
     p = m + 1 + (drives > 0)
     start = 0
     for response in filtered(A, C, partial(_sources, u, p), (N, p)):
         count = len(response)
         chunk = slice(start, start + count)
         powers = _time(chunk, N)[:, None] ** np.arange(degree + 1)
-        parts = [
-            response[..., 0],
-            np.einsum("kd,lc->kldc", powers, directions).reshape(count, l, -1),
-            response[:, :, :drives, -1],
-            response[..., 1 : 1 + m].reshape(count, l, n * m),
-        ]
-        if feedthrough:
-            parts.append(np.einsum("op,kj->kopj", np.eye(l), u[chunk]).reshape(count, l, l * m))
-        parts.append(y[chunk][..., None])
-        yield np.concatenate(parts, axis=2).reshape(count * l, -1)
+        yield _equations(response, powers, u[chunk], y[chunk], feedthrough, directions, drives)
         start += count
 
 
@@ -141,16 +132,25 @@ def _shared_rows(
         R = fold(R, np.concatenate([signals, powers, u[rows], y[rows]], axis=1))
     count, at = len(R), n * p + degree + 1
     response = np.einsum("krp,lrs->klsp", R[:, : n * p].reshape(count, n, p), found.shares)
+    return _equations(
+        response, R[:, n * p : at], R[:, at : at + m], R[:, at + m :], feedthrough, directions, drives
+    )
+
+
+def _equations(
+    response: Array, powers: Array, u: Array, y: Array, feedthrough: bool, directions: Array, drives: int
+) -> Array:
+    """Of a block of samples, l rows each: what states answer, (block, l, n, p), powers of time, inputs, outputs."""
+    (count, l, n, _), m = response.shape, u.shape[1]
     parts = [
         response[..., 0],
-        np.einsum("kd,lc->kldc", R[:, n * p : at], directions).reshape(count, l, -1),
+        np.einsum("kd,lc->kldc", powers, directions).reshape(count, l, -1),
         response[:, :, :drives, -1],
         response[..., 1 : 1 + m].reshape(count, l, n * m),
     ]
     if feedthrough:
-        parts.append(np.einsum("op,kj->kopj", np.eye(l), R[:, at : at + m]).reshape(count, l, l * m))
-    parts.append(R[:, at + m :, None])
-    return np.concatenate(parts, axis=2).reshape(count * l, -1)
+        parts.append(np.einsum("op,kj->kopj", np.eye(l), u).reshape(count, l, l * m))
+    return np.concatenate([*parts, y[..., None]], axis=2).reshape(count * l, -1)
 
 
 def _sources(u: Array, p: int, rows: slice) -> Array:
