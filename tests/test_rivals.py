@@ -132,6 +132,27 @@ def test_norms_are_the_same_in_whatever_units(on, weight, made, seed):
     np.testing.assert_allclose(decided(*scales), decided(np.ones(2), np.ones(2)), atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "penalty", [rivals.GroupL2(weight=0.5), rivals.CLOT(weight=0.5)], ids=["group_l2", "clot"]
+)
+def test_limits_of_moves_told_at_a_sample_are_kept_to_rounding(penalty):
+    limits = mampc.Limits(u_min=-3.0, u_max=3.0, du_max=1.0, y_max=2.0)
+    controller = rivals.Penalised(
+        mampc.TrackingProblem(
+            random_model(1, n=3, m=2, l=2), prediction_horizon=6, control_horizon=3, limits=limits
+        ),
+        penalty=penalty,
+    )
+    rng, state = np.random.default_rng(0), controller.initial_state()
+    for _ in range(25):
+        du_max = rng.uniform(0.0, 1.0, 2)
+        decision = controller.step(
+            state, 1e4 * rng.standard_normal(3), [0.0, 0.0], limits=mampc.Limits(du_max=du_max)
+        )
+        assert (np.abs(decision.u - state.inputs[-1]) <= du_max + 1e-12).all()
+        state = decision.state
+
+
 def test_bounds_that_cross_are_refused_beside_norms_too():
     program = QuadraticProgram(np.eye(2), np.zeros((0, 2)), 2)
     solver = NormsSolver(program, [Norm(1.0, np.eye(2))])

@@ -82,7 +82,6 @@ class Controller(ABC):
         self.levels = None if levels is None else InputLevels(levels, problem)
         self._usual_limits = UsualLimits(self.condensed, self.levels)
         self._some_unlimited = bool(np.isinf([limits.u_min, limits.u_max]).any())
-        self._du_max = limits.du_max if np.isfinite(limits.du_max).any() else None
         self._resolution = SAME * self.condensed.input_prefix
         self._no_violations = np.zeros(model.n_outputs)
         self._unknown_violations = np.full(model.n_outputs, np.nan)
@@ -212,7 +211,7 @@ class Controller(ABC):
         if plan.moves is None or sample is None:
             plan = self._to_hold(plan, sample, state, limits_now.inputs)
         elif plan.objective is None or plan.inputs is None or self._may_leave(limits_now):
-            plan = self._completed(plan, plan.moves, sample, state, limits_now.inputs)
+            plan = self._completed(plan, plan.moves, sample, state, limits_now)
         if sample is not None and self.condensed.ill_conditioned:
             plan = doubted(plan, self.condensed, sample)
         return self._decision(plan, state, limits_now.inputs, start)
@@ -280,7 +279,12 @@ class Controller(ABC):
         """Search the moves for one sample's data."""
 
     def _completed(
-        self, plan: Plan, moves: Array, sample: Sample, state: ControllerState, inputs: InputRange
+        self,
+        plan: Plan,
+        moves: Array,
+        sample: Sample,
+        state: ControllerState,
+        limits: UsualLimits | LimitsNow,
     ) -> Plan:
         """The plan with its inputs, objective and violations, which all belong to the same moves."""
         status, lower_bound, objective, violations = (
@@ -290,12 +294,12 @@ class Controller(ABC):
         if planned is not None:
             planned = planned.reshape(self._shape)
         else:
-            if self._du_max is not None:
-                changes = np.minimum(np.maximum(changes, -self._du_max), self._du_max)
+            if limits.du_max is not None:
+                changes = np.minimum(np.maximum(changes, -limits.du_max), limits.du_max)
             # Sums in this order leave an input that does not move exactly where it was.
             planned = np.add.accumulate(changes)
             planned += applied
-        kept = inputs.clipped(planned)
+        kept = limits.inputs.clipped(planned)
         same = kept.tobytes() == planned.tobytes()  # as nearly always
         if not same and (np.abs(kept - planned) > self._resolution + ROUNDED * np.abs(planned)).any():
             # Planned beyond what counts as a number: this is another plan, of which nothing is proven.

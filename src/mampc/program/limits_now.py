@@ -95,6 +95,7 @@ class UsualLimits:
 
     Attributes:
         inputs: the range of the inputs. Without limits of their own they stay within what counts as a number.
+        du_max: shape (m,); None where no input has one.
         crossed: whether some u_min is above its u_max, so that no input can keep both: never here.
     """
 
@@ -103,6 +104,7 @@ class UsualLimits:
     def __init__(self, condensed: CondensedQP, levels: InputLevels | None = None) -> None:
         limits, shape = condensed.problem.limits, (condensed.problem.control_horizon, 1)
         self._condensed, self._levels = condensed, levels
+        self.du_max = limits.du_max if np.isfinite(limits.du_max).any() else None
         self.inputs = InputRange(
             np.tile(np.maximum(limits.u_min, -LARGEST / 2), shape),
             np.tile(np.minimum(limits.u_max, LARGEST / 2), shape),
