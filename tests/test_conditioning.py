@@ -12,7 +12,7 @@ from mampc.base.words import Remark
 from mampc.methods.exact import ranking
 from mampc.program import refinement
 from mampc.program.condensing import CondensedQP
-from mampc.program.daqp import DaqpSolver
+from mampc.program.daqp import DaqpSolver, active_bounds
 from mampc.program.least_distance import LeastDistance, Nearest, ViolationCost
 from mampc.program.qp import QPSolution, QPStatus
 from mampc.program.refinement import refined
@@ -239,3 +239,36 @@ def test_programs_far_from_zones_are_made_exact_in_few_rounds(k, monkeypatch):
     assert found.excess == pytest.approx(expected.excess, rel=1e-9)
     assert np.allclose(found.moves, expected.moves, atol=1e-6)
     assert len(rounds) <= 10
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_programs_solved_together_are_those_solved_one_by_one(seed):
+    """Near and far, without an answer, and none after the deadline."""
+    rng = np.random.default_rng(seed)
+    k, v, b, K = 4, 1, 9, 7
+    rows = np.vstack([np.eye(k), rng.standard_normal((b - k, k))])
+    violations = np.vstack([np.zeros((b - 2, v)), -np.ones((2, v))])
+    cost = ViolationCost(np.full(v, 10.0 * (seed % 2)), np.ones(v))
+    program = LeastDistance(np.triu(rng.uniform(1, 2, (k, k))), rows, violations, cost, n_simple=k)
+    optima = rng.standard_normal((K, k)) * 10.0 ** rng.uniform(-4, 4, (K, 1))
+    high = rng.uniform(0.1, 1.0, (K, v + b))
+    low = -high - np.where(np.arange(K)[:, None] == 3, 1.2, 0.0) * (np.arange(v + b) == v + 4)
+    high[3, v + 4] = low[3, v + 4] + 1e-3  # out of reach of bounded moves, now and then
+    low[:, :v], high[:, :v] = 0.0, np.inf
+    bounds = np.hstack([low, high])
+    distances = np.array(
+        [np.concatenate(program.distances(*data)) for data in zip(optima, low, high, strict=True)]
+    )
+    alone = [program.solve_at(*data) for data in zip(optima, distances, bounds, strict=True)]
+    active = [None if one.multipliers is None else active_bounds(one.multipliers) for one in alone]
+    for starts in ([None] * K, active):
+        found = program.solve_each(optima, distances, bounds, starts, np.inf)
+        assert found.status == [one.status for one in alone]
+        for moves, multipliers, one in zip(found.moves, found.multipliers, alone, strict=True):
+            if one.moves is not None:
+                np.testing.assert_allclose(moves, one.moves, rtol=1e-9, atol=1e-12)
+                np.testing.assert_allclose(
+                    multipliers, one.multipliers, rtol=1e-6, atol=1e-9 * np.abs(one.multipliers).max()
+                )
+    late = program.solve_each(optima, distances, bounds, active, -np.inf)
+    assert set(late.status) == {QPStatus.TIME_LIMIT}

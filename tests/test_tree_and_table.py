@@ -10,6 +10,7 @@ from builders import random_model
 from mampc import Status
 from mampc.methods.exact import ranking
 from seeds import seeds
+from test_tree import priced_case
 
 
 def decide(problem, rules, x, reference):
@@ -72,3 +73,19 @@ def test_least_sizes_are_proven_alike_by_table_and_tree(seed, monkeypatch):
     by_tree = decide(*sized_case(seed))
     assert by_tree.status is by_table.status is Status.OPTIMAL
     assert by_tree.objective == pytest.approx(by_table.objective, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", seeds(60, quick=10))
+def test_no_plan_of_the_last_sample_changes_the_optimum(seed, monkeypatch):
+    """A tree tries its pattern first, whatever it is: moves that the rules forbid too."""
+    monkeypatch.setattr(ranking, "LARGEST_TABLE", 0)
+    problem, rules, x, reference = priced_case(seed)
+    controller, rng = mampc.MAMPC(problem, rules), np.random.default_rng(seed)
+    state = controller.initial_state()
+    decision = controller.step(state, x, reference)
+    assert decision.status is Status.OPTIMAL
+    np.testing.assert_array_equal(decision.state.guess[:-1], decision.changes[1:])
+    for guess in (decision.changes, rng.standard_normal(decision.changes.shape), np.zeros((4, 2))):
+        again = controller.step(state._replace(guess=guess), x, reference)
+        assert again.status is Status.OPTIMAL
+        assert again.objective == pytest.approx(decision.objective, rel=1e-9)

@@ -12,15 +12,16 @@ import mampc
 from builders import cost_of, distance, predicted, random_model
 from mampc import Status
 from mampc.methods import local_search
-from mampc.methods.exact import relaxation, sample_problem, search, zone_search
+from mampc.methods.exact import sample_problem, search, zone_search
 from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.sample_problem import SampleProblem
 from mampc.methods.exact.terms import Squares
 from mampc.methods.exact.zone_search import single_moves
 from mampc.moves.admissible import AdmissiblePatterns
 from mampc.moves.pattern_solver import Incumbent, PatternSolver
+from mampc.program import least_distance
 from mampc.program.condensing import CondensedQP
-from mampc.program.least_distance import LeastDistance
+from mampc.program.daqp import DaqpSolver
 from referees import (
     assert_best_of_all_patterns,
     best_on,
@@ -145,15 +146,15 @@ def test_single_moves_are_tried_no_longer_than_there_is_time(monkeypatch):
 @pytest.mark.parametrize("limit", [1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0])
 def test_no_program_begins_after_the_time_limit(limit, monkeypatch):
     """On a clock that each program puts on by one: those in a row check it as often as they are solved."""
-    now, bounds, solve_at = [0.0], [], LeastDistance.solve_at
+    now, bounds, solve_anew = [0.0], [], DaqpSolver.solve_anew
 
     def solved(*of):
         now[0] += 1.0
-        return solve_at(*of)
+        return solve_anew(*of)
 
-    for module in (local_search, relaxation, sample_problem, search):
+    for module in (local_search, least_distance, sample_problem, search):
         monkeypatch.setattr(module, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(LeastDistance, "solve_at", solved)
+    monkeypatch.setattr(DaqpSolver, "solve_anew", solved)
     for seed in range(6):
         problem, x, reference, _ = random_problem(seed, control_horizon=6)
         rules = mampc.MoveRules(price=0.05, max_moves=4)

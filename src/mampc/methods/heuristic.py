@@ -19,7 +19,7 @@ from mampc.base.checks import Array, BoolArray, as_flag
 from mampc.base.tolerances import INSIDE, tie
 from mampc.base.words import Remark, Status
 from mampc.methods.exact.search import Exact, ExactSearch
-from mampc.methods.method import HELD_BY, Plan
+from mampc.methods.method import HELD_BY, Plan, shifted
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.moves.pattern_solver import Incumbent, OnPattern, PatternSolver
 from mampc.moves.rules import MoveRules
@@ -147,11 +147,7 @@ class HeuristicSearch:
         )
 
     def _shifted(self, moves: Array | None) -> Array | None:
-        """Moves as they stand one sample later, shape (nc, m)."""
-        if moves is None:
-            return None
-        m = self.admissible.n_inputs
-        return np.concatenate([moves[m:], np.zeros(m)]).reshape(-1, m)
+        return None if moves is None else shifted(moves, self.admissible.n_inputs)
 
     def _certified(self, plan: Plan, sample: Sample, inputs: Array) -> Plan:
         """The plan with a proven lower bound."""

@@ -57,6 +57,11 @@ def doubted(plan: Plan, condensed: CondensedQP, sample: Sample) -> Plan:
     return plan._replace(status=status, lower_bound=bound - doubt, remarks=(*remarks, Remark.ROUNDING))
 
 
+def shifted(moves: Array, m: int) -> Array:
+    """Moves of m inputs as they stand one sample later, shape (nc, m)."""
+    return np.concatenate([moves[m:], np.zeros(m)]).reshape(-1, m)
+
+
 class Search(Protocol):
     """A method prepared for one problem: plans each sample after `warm_up` samples of plain MPC."""
 

@@ -153,6 +153,9 @@ class AdmissiblePatterns:
 
     def allows(self, pattern: BoolArray, allowance: Allowance) -> bool:
         """Whether a pattern, shape (n_moves,), is admissible."""
+        if self.simple:
+            within = not (pattern & ~self.open(allowance)).any()
+            return within and int(np.count_nonzero(pattern)) <= allowance.left
         builder = PatternBuilder(self, allowance)
         return all(builder.add(int(i)) for i in np.flatnonzero(pattern))
 

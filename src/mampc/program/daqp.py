@@ -15,6 +15,7 @@ from mampc.base.checks import Array
 from mampc.base.errors import MampcError
 from mampc.program.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram
 
+Senses = np.ndarray[tuple[int, ...], np.dtype[np.intc]]
 _STATUS = {
     1: QPStatus.OPTIMAL,
     2: QPStatus.OPTIMAL,  # daqp's "soft optimal"; no soft rows are used here
@@ -107,7 +108,7 @@ class DaqpSolver:
         if active is self._inactive:
             changed["sense"] = active
         elif active is not None:
-            changed["sense"] = _there(active, lower, upper)
+            changed["sense"] = there(active, lower, upper)
         flag = model.update(**changed)
         if flag < 0:
             return self._refused(flag)
@@ -118,17 +119,16 @@ class DaqpSolver:
                 return solution
         return self._failed(flag, info, f, lower, upper)
 
-    def solve_anew(self, f: Array, lower: Array, upper: Array, active: Array | None = None) -> QPSolution:
+    def solve_anew(self, f: Array, lower: Array, upper: Array, sense: Senses | None = None) -> QPSolution:
         """`start` and `solve`, for contiguous arrays of the right shape that are nobody else's.
 
-        f is no longer than ORDINARY.
+        f is no longer than ORDINARY, and the active bounds are those that are `there`.
         """
         model = getattr(self._local, "model", None)
         if model is None or self._units is not None:
-            self.start(active)
+            self.start(sense)
             return self.solve(f, lower, upper)
-        sense = self._inactive if active is None else _there(active, lower, upper)
-        flag = model.update(f=f, blower=lower, bupper=upper, sense=sense)
+        flag = model.update(f=f, blower=lower, bupper=upper, sense=self._inactive if sense is None else sense)
         if flag < 0:
             return self._refused(flag)
         z, _, flag, info = model.solve()
@@ -203,7 +203,7 @@ class DaqpSolver:
             and program.duality_gap(lower, upper, solution) <= ROUNDING * gradient * size
         )
 
-    def start(self, active: Array | None = None) -> None:
+    def start(self, active: Array | Senses | None = None) -> None:
         """Begin anew: the next solve starts from these active bounds, default none.
 
         They are flags, shape (n_bounds,): 1 at an upper, 3 at a lower bound, else 0.
@@ -265,7 +265,7 @@ def active_bounds(multipliers: Array) -> Array:
     return active
 
 
-def _there(active: Array, lower: Array, upper: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.intc]]:
+def there(active: Array, lower: Array, upper: Array) -> Senses:
     """The active bounds but for those that went away since, which cannot be started from."""
     flags = active.astype(np.intc)
     at = flags.nonzero()[0]
@@ -273,6 +273,13 @@ def _there(active: Array, lower: Array, upper: Array) -> np.ndarray[tuple[int, .
     for i, flag, low, high in limits:
         if low <= -GONE if flag == ACTIVE_BELOW else high >= GONE:
             flags[i] = 0
+    return flags
+
+
+def each_there(active: Array, lower: Array, upper: Array) -> Senses:
+    """`there` of K programs, shape (K, n_bounds)."""
+    flags = active.astype(np.intc)
+    flags[(flags == ACTIVE_BELOW) & (lower <= -GONE) | (flags == ACTIVE_ABOVE) & (upper >= GONE)] = 0
     return flags
 
 

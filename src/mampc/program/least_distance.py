@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from functools import cached_property
 from math import frexp, isfinite, ldexp
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
-from mampc.program.daqp import ORDINARY, DaqpSolver
+from mampc.program.daqp import ORDINARY, DaqpSolver, each_there, there
 from mampc.program.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram
 from mampc.program.refinement import refined
 from mampc.program.sample import Indices
@@ -42,6 +43,14 @@ class Nearest(NamedTuple):
     status: QPStatus
     iterations: int
     violated: bool = False  # whether some violation is above zero
+
+
+class NearestOfEach(NamedTuple):
+    """`Nearest` of K programs: moves (K, moves) and multipliers (K, bounds), zero where the status is not OPTIMAL."""
+
+    moves: Array
+    multipliers: Array
+    status: list[QPStatus]
 
 
 class ViolationCost(NamedTuple):
@@ -139,7 +148,8 @@ class LeastDistance:
             scaled = distances / scale
             low, high = scaled[:size], scaled[size:]
         if self._ordinary:
-            solution = self._solver.solve_anew(f, low, high, active)
+            sense = None if active is None else there(active, low, high)
+            solution = self._solver.solve_anew(f, low, high, sense)
         else:
             self._solver.start(active)
             solution = self._solver.solve(f, low, high)
@@ -165,6 +175,40 @@ class LeastDistance:
             if force:
                 moves[i] = bounds[v + i + size if force > 0 else v + i]
         return Nearest(moves, excess, multipliers, status, iterations, violated)
+
+    def solve_each(
+        self, optima: Array, distances: Array, bounds: Array, active: list[Array | None], deadline: float
+    ) -> NearestOfEach:
+        """`solve_at` for K programs, arrays of K rows; none begins after the deadline, of `perf_counter`."""
+        v, K, size = self._v, len(optima), len(self.even)
+        low, high, status = distances[:, :size], distances[:, size:], [QPStatus.TIME_LIMIT] * K
+        far = np.maximum(low.max(axis=1, initial=-np.inf), -high.min(axis=1, initial=np.inf))
+        plain = (far > 0) & (far < np.inf) & (self._ordinary and not self._doubtful)
+        enlarged = plain & (far > (1.0 if self._limited else 0.0))
+        scale = np.ldexp(1.0, np.where(enlarged, np.frexp(far)[1], 0))[:, None]
+        f, low, high = self._f / scale, low / scale, high / scale
+        z, pull = np.zeros((K, len(self._f))), np.zeros((K, size))
+        started = np.array([self._nothing if flags is None else flags for flags in active])
+        senses = each_there(started, low, high)
+        alone: dict[int, Nearest] = {}
+        for k in range(K):
+            if perf_counter() > deadline:
+                break
+            found = self._solver.solve_anew(f[k], low[k], high[k], senses[k]) if plain[k] else None
+            if found is not None and found.z is not None and found.multipliers is not None:
+                z[k], pull[k], status[k] = found.z, found.multipliers, QPStatus.OPTIMAL
+            elif found is None or found.status is not QPStatus.TIME_LIMIT:
+                alone[k] = self.solve_at(optima[k], distances[k], bounds[k], active[k])
+                status[k] = alone[k].status
+        moves, multipliers = optima + (z[:, v:] * scale) @ self._inverse.T, pull * (scale * self.even)
+        force, own = pull[:, v : v + self._n_simple], moves[:, : self._n_simple]
+        own[force > 0] = bounds[:, size + v :][:, : self._n_simple][force > 0]
+        own[force < 0] = bounds[:, v : v + self._n_simple][force < 0]
+        for k, nearest in alone.items():
+            moves[k] = multipliers[k] = 0.0
+            if nearest.moves is not None and nearest.multipliers is not None:
+                moves[k], multipliers[k] = nearest.moves, nearest.multipliers
+        return NearestOfEach(moves, multipliers, status)
 
     def _scaled(self, scale: float) -> tuple[Array, Array]:
         """The linear term of all lengths divided by a power of two, and what its multipliers are multiplied by."""

@@ -7,7 +7,6 @@ give a valid bound, so that a few rounds do.
 
 from __future__ import annotations
 
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -179,17 +178,17 @@ class SampleRelaxation:
                 np.where(downwards, np.minimum(most, 0.0), most),
                 slope,
             )
-            solved = np.zeros(len(rows), dtype=bool)
+            found = program.solve_each(
+                optima, distances, bounds, [active[row] for row in rows], self._deadline
+            )
+            solved = np.array([ended is QPStatus.OPTIMAL for ended in found.status])
+            multipliers[rows[solved]], moves[rows[solved]] = found.multipliers[solved], found.moves[solved]
+            flags = active_bounds(found.multipliers)
             for k, row in enumerate(rows.tolist()):
-                if perf_counter() > self._deadline:
-                    break
-                found = program.solve_at(optima[k], distances[k], bounds[k], active[row])
-                if found.moves is not None and found.multipliers is not None:
-                    solved[k], status[row] = True, QPStatus.OPTIMAL
-                    active[row] = active_bounds(found.multipliers)
-                    multipliers[row], moves[row] = found.multipliers, found.moves
-                elif status[row] is not QPStatus.OPTIMAL:
-                    status[row], active[row] = found.status, None
+                if solved[k]:
+                    status[row], active[row] = QPStatus.OPTIMAL, flags[k]
+                elif status[row] is not QPStatus.OPTIMAL and found.status[k] is not QPStatus.TIME_LIMIT:
+                    status[row], active[row] = found.status[k], None
             pull = multipliers[rows, own] + slope
             pulls[rows[solved]] = pull[solved]
             # At zero the price of the other direction has to hold the move there too.

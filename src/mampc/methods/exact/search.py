@@ -27,7 +27,7 @@ from mampc.methods.exact.open_patterns import OpenPatterns
 from mampc.methods.exact.ranking import LARGEST_BESIDE_DATA, Ranking, ranking_of
 from mampc.methods.exact.relaxation import Relaxation
 from mampc.methods.exact.tree import PatternTree
-from mampc.methods.method import HELD_BY, Plan
+from mampc.methods.method import HELD_BY, Plan, shifted
 from mampc.moves.admissible import AdmissiblePatterns, Allowance
 from mampc.moves.pattern_solver import Incumbent, OnPattern, PatternSolver
 from mampc.moves.rules import MoveRules
@@ -124,19 +124,19 @@ class ExactSearch:
         return self.admissible.listed(MOST_BESIDE_LEVELS, free)
 
     def plan(self, sample: Sample, inputs: Array, guess: Array | None = None) -> Plan:
-        """The best moves of all admissible patterns for one sample."""
+        """The best moves of all admissible patterns for one sample; a tree tries those of the `guess` early."""
         past, solver = self.admissible.allowance(inputs, sample.frozen), self._solver.after(inputs)
         if past.exceeded:
-            plan = self._search(sample, past, solver)
+            plan = self._search(sample, past, solver, guess)
             return plan._replace(remarks=(Remark.BUDGET_EXCEEDED, *plan.remarks))
-        return self._search(sample, past, solver)
+        return self._search(sample, past, solver, guess)
 
-    def _search(self, sample: Sample, past: Allowance, solver: PatternSolver) -> Plan:
+    def _search(self, sample: Sample, past: Allowance, solver: PatternSolver, guess: Array | None) -> Plan:
         if self._free is not None:
             return self._search_levels(self._free, sample, past, solver)
         ranking = self._ranking
         if ranking is None:
-            return self._search_tree(sample, past, solver)
+            return self._search_tree(sample, past, solver, guess)
         bounds = ranking.bounds(sample.moves, sample.cost, past, sample.later_data)
         best = int(bounds.argmin())
         if not (self.admissible.sized or self.admissible.on_levels):
@@ -222,12 +222,16 @@ class ExactSearch:
                 at, bound = open_.best()
         return self._plan(sample, best, best.objective)
 
-    def _search_tree(self, sample: Sample, past: Allowance, solver: PatternSolver) -> Plan:
-        best = Incumbent()
-        open_bound = self._tree.search(sample, past, best, self._deadline(), solver)
-        if open_bound < best.objective:
-            return self._plan(sample, best, open_bound, Status.TIME_LIMIT)
-        return self._plan(sample, best, best.objective)
+    def _search_tree(
+        self, sample: Sample, past: Allowance, solver: PatternSolver, guess: Array | None
+    ) -> Plan:
+        best, first = Incumbent(), None if guess is None else guess.ravel() != 0
+        open_bound = self._tree.search(sample, past, best, self._deadline(), solver, first)
+        status = Status.TIME_LIMIT if open_bound < best.objective else Status.OPTIMAL
+        plan = self._plan(sample, best, min(open_bound, best.objective), status)
+        return (
+            plan if best.moves is None else plan._replace(guess=shifted(best.moves, self.admissible.n_inputs))
+        )
 
     def _plan(self, sample: Sample, best: Incumbent, bound: float, status: Status = Status.OPTIMAL) -> Plan:
         remarks: tuple[Remark, ...] = ()

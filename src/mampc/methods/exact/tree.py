@@ -65,13 +65,20 @@ class PatternTree:
         self._zoned = condensed.bounds.zones is not None and not admissible.sized
 
     def search(
-        self, sample: Sample, allowance: Allowance, best: Incumbent, deadline: float, solver: PatternSolver
+        self,
+        sample: Sample,
+        allowance: Allowance,
+        best: Incumbent,
+        deadline: float,
+        solver: PatternSolver,
+        first: BoolArray | None = None,
     ) -> float:
         """Visit every admissible pattern that may cost less than the best plan, to which better ones are offered.
 
         Args:
             deadline: of `perf_counter`.
             solver: of the programs on patterns.
+            first: a pattern to try before others, if it is admissible, where moves have limits and a price.
 
         Returns:
             A lower bound over everything that was not visited: infinite when the search is complete.
@@ -80,6 +87,8 @@ class PatternTree:
             self._squares, self._relaxation, self._admissible, solver, sample, allowance, best, deadline
         )
         problem.offer(problem.pattern(np.zeros(0, dtype=np.intp)))
+        if self._close and first is not None and self._admissible.allows(first, allowance):
+            problem.offer_first(first)
         if not (allowance.left > 0 and len(problem.order)):
             return np.inf
         if self._zoned:
