@@ -28,7 +28,7 @@ import batches
 import mampc
 import solvers
 import sparse
-from measuring import LAMBDA, Asked, Row, closed_loop, interleaved, steps_of, tank_problem
+from measuring import LAMBDA, Asked, Row, closed_loop, interleaved, options, steps_of, tank_problem
 
 RULES = mampc.MoveRules(max_moves=3, sparsity_horizon=3)
 PAPER = mampc.Alternating(penalty=10.0, tolerance=1e-4)
@@ -217,6 +217,7 @@ ROWS: list[Callable[[], Row]] = [
 
 
 def main() -> None:
+    options(__doc__).parse_args()
     console = Console()
     if not console.is_terminal:
         console = Console(width=160)

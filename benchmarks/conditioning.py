@@ -22,6 +22,7 @@ from rich.progress import track
 from rich.table import Table
 
 import mampc
+from measuring import options
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 TIME_LIMIT = 60.0  # seconds a step, so that a busy machine changes nothing
@@ -59,7 +60,11 @@ def measure(seed: int) -> Result:
 
 
 def main() -> None:
-    first, last = (int(argument) for argument in sys.argv[1:] or (0, 2000))
+    parser = options(__doc__)
+    parser.add_argument("first", type=int, nargs="?", default=0, help="seed of the first instance")
+    parser.add_argument("last", type=int, nargs="?", default=2000, help="one beyond that of the last")
+    asked = parser.parse_args()
+    first, last = asked.first, asked.last
     calls = Parallel(n_jobs=-1, return_as="generator")(delayed(measure)(seed) for seed in range(first, last))
     console = Console()
     if not console.is_terminal:

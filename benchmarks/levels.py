@@ -18,7 +18,7 @@ from rich.progress import track
 from rich.table import Table
 
 import mampc
-from measuring import three_inputs
+from measuring import options, three_inputs
 
 TIMES = mampc.OnOff(min_on=3.0, min_off=2.0)
 STEPS = 200
@@ -84,6 +84,7 @@ def cases() -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def main() -> None:
+    options(__doc__).parse_args()
     table = Table("case", "mean output", "moves a sample", "proven", "step, median", "p99", "largest")
     for name, settings in track(list(cases()), "loops"):
         run = mampc.simulate(steps=STEPS, progress=False, **settings)
