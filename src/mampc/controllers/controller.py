@@ -365,9 +365,7 @@ class Controller(ABC):
         margins = sample.margins
         if margins[margins.argmin()] > INSIDE:
             return Plan(sample.moves, Status.OPTIMAL, 0, None, None, sample.inputs, sample.cost)
-        nearest = self.condensed.plain.nearest(
-            sample.target, sample.both_bounds, active=state.active if self._warm else None
-        )
+        nearest = self.condensed.nearest(sample, state.active if self._warm else None)
         if nearest.moves is None or nearest.multipliers is None:
             return Plan(None, HELD_BY[nearest.status], nearest.iterations)
         active = active_bounds(nearest.multipliers) if self._warm else None

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import le
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -295,9 +296,8 @@ class Sensors:
         if step.ndim > 1:
             settled = bool(((step > 0.0) & (step <= self._coarse_step)).all())
         else:
-            settled = all(
-                0.0 < size <= coarse for size, coarse in zip(step.tolist(), self._coarse, strict=True)
-            )
+            sizes = step.tolist()
+            settled = min(sizes) > 0.0 and all(map(le, sizes, self._coarse))
         if settled:
             return step
         change, known = np.where(changed, np.abs(y - state.y), 0.0), np.where(step > 0.0, step, 1.0)

@@ -31,7 +31,7 @@ from mampc.base.errors import MampcError, MampcWarning
 from mampc.base.tolerances import prefix, size_of_move
 from mampc.program.bounds import Bounds
 from mampc.program.input_cost import distance_from_targets, price_of_inputs
-from mampc.program.least_distance import ROUNDING
+from mampc.program.least_distance import ROUNDING, Nearest
 from mampc.program.parameter import Parameter
 from mampc.program.prediction import Prediction
 from mampc.program.problem import TrackingProblem
@@ -256,6 +256,18 @@ class CondensedQP:
         """
         return self.bounds.excess(moves, sample.lower, sample.upper, faded=faded)
 
+    def nearest(self, sample: Sample, active: Array | None = None) -> Nearest:
+        """The best moves within limits with every move free.
+
+        `active`: bounds to start from, flags of `DaqpSolver.start`, shape (n_bounds,).
+        """
+        return self.plain.program.solve_at(sample.moves, self._distances(sample), sample.both_bounds, active)
+
+    def _distances(self, sample: Sample) -> Array:
+        if sample.distances is None:
+            sample.distances = self.plain.program.distances(sample.moves, sample.both_bounds)
+        return sample.distances
+
     def priced(self, sample: Sample, multipliers: Array) -> LeastSquares:
         """The problem with its limits priced by multipliers instead of kept (Lagrangian relaxation).
 
@@ -267,9 +279,7 @@ class CondensedQP:
             optimum there.
         """
         program = self.plain.program
-        if sample.distances is None:
-            sample.distances = program.distances(sample.moves, sample.lower, sample.upper)
-        delta, excess = program.relaxed(sample.distances, multipliers)
+        delta, excess = program.relaxed(self._distances(sample), multipliers)
         return LeastSquares(sample.target + delta, sample.cost + float(excess))
 
     def relaxed_limits(self, sample: Sample, multipliers: Array) -> tuple[Array, float]:

@@ -118,10 +118,10 @@ class LeastDistance:
             keeps_data=True,
         )
 
-    def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
+    def solve(self, optimum: Array, lower: Array, upper: Array) -> Nearest:
         """The best moves, given the optimum without limits, shape (k,), and all bounds, shape (v + b,)."""
-        low, high = self.distances(optimum, lower, upper)
-        return self.solve_at(optimum, np.concatenate((low, high)), np.concatenate((lower, upper)), active)
+        bounds = np.concatenate((lower, upper))
+        return self.solve_at(optimum, self.distances(optimum, bounds), bounds)
 
     def solve_at(
         self,
@@ -296,12 +296,12 @@ class LeastDistance:
             excess += self._cost.of(better.z[:v])
         return Nearest(moves, excess, better.multipliers, QPStatus.OPTIMAL, iterations, violated)
 
-    def relaxed(self, distances: tuple[Array, Array], multipliers: Array) -> tuple[Array, Array]:
+    def relaxed(self, distances: Array, multipliers: Array) -> tuple[Array, Array]:
         """The optima with limits priced by multipliers: their delta, and their cost beyond that of the one without.
 
         Multipliers of shape (..., v + b), `distances` of the bounds, as `distances` gives them.
         """
-        pull, v, (low, high) = multipliers / self.even, self._v, distances
+        pull, v, (low, high) = multipliers / self.even, self._v, distances.reshape(2, -1)
         gradient = pull.dot(self._every)
         gradient += self._f
         square = 0.25 * _products(gradient, gradient)
@@ -310,12 +310,18 @@ class LeastDistance:
         lost = gradient.shape[-1] * ROUNDING * (square + abs(kept))
         return -0.5 * gradient[..., v:], -square - kept - lost
 
-    def distances(self, optimum: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """The bounds as distances from the optimum."""
-        low, high, reached = lower * self.even, upper * self.even, self.even_rows.dot(optimum)
-        low[self._v :] -= reached
-        high[self._v :] -= reached
-        return low, high
+    def distances(self, optimum: Array, bounds: Array) -> Array:
+        """The bounds, lower ones and behind them upper ones, as distances from the optimum."""
+        even, rows = self._of_both
+        distances = bounds * even
+        distances -= rows.dot(optimum)
+        return distances
+
+    @cached_property
+    def _of_both(self) -> tuple[Array, Array]:
+        """Factors of lower and upper bounds, and how much nearer both come per move."""
+        rows = np.vstack([np.zeros((self._v, len(self._R))), self.even_rows])
+        return np.concatenate([self.even, self.even]), np.vstack([rows, rows])
 
     def _far(self, low: Array, high: Array) -> float:
         """How far the optimum is from what it should keep; not above zero where it keeps all bounds."""

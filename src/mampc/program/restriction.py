@@ -75,30 +75,24 @@ class Restriction:
             n_simple=self._n_simple, time_limit=self._time_limit,
         )  # fmt: skip
 
-    def solve(self, optimum: Array, lower: Array, upper: Array, active: Array | None = None) -> Nearest:
+    def solve(self, optimum: Array, lower: Array, upper: Array) -> Nearest:
         """The best moves within limits.
 
         Args:
             optimum: `optimum` of the sample.
             lower, upper: the bounds that are kept.
-            active: bounds to start from, flags of `DaqpSolver.start`, shape (n_bounds,).
 
         Returns:
             As `LeastDistance`, multipliers being those of all bounds, shape (n_bounds,).
         """
-        if active is not None:
-            active = active[self.bounds]
-        return self._of_all_bounds(self.program.solve(optimum, lower, upper, active))
+        return self._of_all_bounds(self.program.solve(optimum, lower, upper))
 
-    def nearest(
-        self, target: Array, bounds: Array, cutoff: float = np.inf, active: Array | None = None
-    ) -> Nearest:
+    def nearest(self, target: Array, bounds: Array, cutoff: float = np.inf) -> Nearest:
         """The best moves within limits, if they cost less than the cutoff, with what they cost more than all moves do.
 
         Args:
             target: of the sample.
             bounds: all lower bounds, and behind them all upper ones, shape (2 n_bounds,).
-            active: as `solve` takes it.
         """
         k = len(self.moves)
         of_target, which, even = self._of_sample
@@ -106,9 +100,7 @@ class Restriction:
         missed, distances = values[k : len(target)], given * even
         distances -= values[len(target) :]
         excess = float(missed.dot(missed)) if len(missed) else 0.0
-        nearest = self.program.solve_at(
-            values[:k], distances, given, None if active is None else active[self.bounds], cutoff - excess
-        )
+        nearest = self.program.solve_at(values[:k], distances, given, None, cutoff - excess)
         return self._of_all_bounds(nearest, excess)
 
     @cached_property

@@ -117,7 +117,7 @@ class Sample(Optimum):
         self._margins: Array | None = None
         self._constant: float | None = None
         self.cost = _cost(data, parts)
-        self.distances: tuple[Array, Array] | None = None
+        self.distances: Array | None = None
         if bounds_now is not None:
             data[parts.lower], data[parts.upper] = bounds_now.lower, bounds_now.upper
             self._margins = bounds_now.margins(data[parts.moves])

@@ -147,7 +147,7 @@ class SampleRelaxation:
         v, n_simple, none = of.moves.start, of.n_simple, np.zeros(len(optimum))
         self._lower = np.concatenate((sample.lower[:v], none, sample.lower[n_simple:]))
         self._upper = np.concatenate((sample.upper[:v], none, sample.upper[n_simple:]))
-        self._distances = of.program.distances(optimum, self._lower, self._upper)
+        self._distances = of.program.distances(optimum, np.concatenate((self._lower, self._upper)))
         self.start = Start(None, np.where(optimum < 0, -1.0, 1.0))
 
     def solve(self, low: Array, high: Array) -> Multipliers:

@@ -191,7 +191,7 @@ class ExactSearch:
         rounding, open_ = condensed.rounding(sample), OpenPatterns(ranking, sample, past, bounds)
         cutoff, margins = np.inf, sample.margins
         if len(margins) and margins[margins.argmin()] < 0:
-            plain = condensed.plain.nearest(sample.target, sample.both_bounds)
+            plain = condensed.nearest(sample)
             first = solver.priced(sample, plain.multipliers)
             if first is not None:
                 open_.price(first, cutoff)
