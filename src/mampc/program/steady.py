@@ -85,7 +85,12 @@ class SteadyTarget:
         k = self._steady.shape[1]
         H = 2 * (weighted.T @ weighted + NEAREST * to_u.T @ to_u)
         H += NEAREST**2 * max(np.trace(H) / max(k, 1), 1e-300) * np.eye(k)
-        self._solver = DaqpSolver(QuadraticProgram(H, to_u, 0))
+        # In these coordinates the Hessian is I: daqp regularises smaller ones about where it was last.
+        curvature, directions = np.linalg.eigh(H)
+        self._of = directions / np.sqrt(
+            np.maximum(curvature, np.finfo(float).eps * curvature.max(initial=0.0))
+        )
+        self._solver = DaqpSolver(QuadraticProgram(np.eye(k), to_u @ self._of, 0))
         self._weighted, self._to_u, self._shape = weighted, to_u, (n, l)
 
     def at(self, p: Array) -> Steady:
@@ -104,8 +109,8 @@ class SteadyTarget:
         low = np.maximum((limits.u_min - model.u_op) / self._unit - particular[n:], -UNBOUNDED)
         high = np.minimum((limits.u_max - model.u_op) / self._unit - particular[n:], UNBOUNDED)
         self._solver.start()
-        solution = self._solver.solve(f, low, high)
-        z = np.zeros(len(f)) if solution.z is None else solution.z
+        solution = self._solver.solve(self._of.T @ f, low, high)
+        z = np.zeros(len(f)) if solution.z is None else self._of @ solution.z
         both = particular + self._steady @ z
         x, u = self._size * both[:n], model.u_op + self._unit * both[n:]
         u = np.clip(u, limits.u_min, limits.u_max)
