@@ -157,6 +157,16 @@ def test_values_of_a_setting_are_stepped_together_as_one_by_one(monkeypatch):
             np.testing.assert_allclose(batch.u[s], run.u, atol=1e-8, rtol=0)
 
 
+def test_limits_of_moves_stop_rounded_inputs_too():
+    problem = tank_problem(limits=mampc.Limits(u_min=0.0, u_max=100.0, du_max=1.3))
+    rule = mampc.rivals.Rounded(mampc.MPC(problem), step=2.0)
+    batch = assert_equal_to_single_runs(
+        TANK, mampc.Regulator(rule), tank_reference(30), noise=0.1, seeds=(0,)
+    )
+    moves = np.abs(np.diff(batch.u, axis=1))
+    assert 1.29 < moves.max() <= 1.3 + 1e-9
+
+
 def test_a_plant_with_measured_disturbances_and_faults():
     plant = mampc.plants.SolidOxideFuelCell()
     model = mampc.linearise(plant).discretise(0.5)

@@ -224,6 +224,7 @@ def test_loads_and_reference_changes_may_be_told_where_inputs_have_no_limits():
         ({"loads": 3}, "loads"),
         ({"seed": -1}, "seed"),
         ({"baseline": "mpc"}, "baseline"),
+        ({"jobs": 0}, "--jobs: expected -1"),
     ],
 )
 def test_what_does_not_fit_is_told(settings, words):

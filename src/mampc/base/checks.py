@@ -160,6 +160,13 @@ def as_instance(name: str, value: Any, kind: type[T]) -> T:
     return value
 
 
+def as_jobs(jobs: int) -> int:
+    """A number of processes, -1 for one a core; raises `MampcError`."""
+    if as_whole("--jobs", jobs, -1) == 0:
+        raise MampcError(f"--jobs: expected -1 for one a core, or a number of processes, received {jobs}")
+    return jobs
+
+
 def as_flag(name: str, value: Any) -> bool:
     """True or false; raises `MampcError` for anything else, such as the text "no"."""
     if not isinstance(value, bool):

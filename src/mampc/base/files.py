@@ -64,7 +64,8 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         yield unfinished
         unfinished.replace(target)
     except OSError as error:
-        raise MampcError(f"{target}: expected a file that can be written, received: {error}") from None
+        why = error.strerror or error
+        raise MampcError(f"{target}: expected a file that can be written, received: {why}") from None
     finally:
         with suppress(OSError):  # as where the name is too long to be a file's
             unfinished.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mampc.base.checks import as_jobs
 from mampc.base.errors import MampcError, shown
 from mampc.base.files import made_folder
 from mampc.compare.fronts import Point
@@ -103,8 +104,7 @@ def run_sweep(
     Raises:
         MampcError: values that do not fit the study, results of another sweep, or a scheduler that is not there.
     """
-    if jobs == 0 or jobs < -1:
-        raise MampcError(f"--jobs: expected -1 for one a core, or a number of processes, received {jobs}")
+    as_jobs(jobs)
     journal = Journal(made_folder(folder) / "sweep.jsonl", sweep.identity)
     tasks = sweep.tasks
     missing = [task for task in tasks if task.name not in journal.done]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_number, as_whole
+from mampc.base.checks import Array, as_jobs, as_number, as_whole
 from mampc.base.errors import MampcError
 from mampc.compare.candidates import Candidate, candidates
 from mampc.compare.fronts import Estimate, Point, non_dominated
@@ -175,6 +175,7 @@ def tune(
     """
     goal = Goal.asked(max_error_increase, max_moves_per_hour)
     as_whole("seed", seed, 0)
+    as_jobs(jobs)
     plain = _plain(model, limits, output_weight, baseline)
     problem = plain.controller.problem
     around = Surroundings.of(problem, noise, reference_changes, loads)

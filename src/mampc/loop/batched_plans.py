@@ -223,14 +223,16 @@ class BatchedRule(BatchedPlans):
 
     def __init__(self, rule: Rule, preview: bool, inner: BatchedPlans) -> None:
         super().__init__(rule, preview)
-        self._rule, self._inner = rule, inner
+        self._rule, self._inner, self._du_max = rule, inner, rule.problem.limits.du_max
 
     def decide(
         self, parameters: Array, inputs: Array, hypotheses: Array | None = None
     ) -> tuple[BoolArray, Array]:
         decided, wanted = self._inner.decide(parameters, inputs, hypotheses)
-        first = self._rule.chosen(wanted, inputs[:, -1])
-        return decided & ((first >= self._low) & (first <= self._high)).all(axis=1), first
+        last = inputs[:, -1]
+        first = self._rule.chosen(wanted, last)
+        kept = (first >= self._low) & (first <= self._high) & (np.abs(first - last) <= self._du_max)
+        return decided & kept.all(axis=1), first
 
 
 class BatchedBank(BatchedPlans):
