@@ -256,9 +256,7 @@ def test_programs_solved_together_are_those_solved_one_by_one(seed):
     high[3, v + 4] = low[3, v + 4] + 1e-3  # out of reach of bounded moves, now and then
     low[:, :v], high[:, :v] = 0.0, np.inf
     bounds = np.hstack([low, high])
-    distances = np.array(
-        [np.concatenate(program.distances(*data)) for data in zip(optima, low, high, strict=True)]
-    )
+    distances = np.array([program.distances(*data) for data in zip(optima, bounds, strict=True)])
     alone = [program.solve_at(*data) for data in zip(optima, distances, bounds, strict=True)]
     active = [None if one.multipliers is None else active_bounds(one.multipliers) for one in alone]
     for starts in ([None] * K, active):

@@ -19,14 +19,14 @@ import numpy as np
 
 from mampc.base.checks import Array, BoolArray
 from mampc.program.daqp import ORDINARY, DaqpSolver, each_there, there
-from mampc.program.qp import UNBOUNDED, QPSolution, QPStatus, QuadraticProgram
+from mampc.program.qp import QPSolution, QPStatus, QuadraticProgram
 from mampc.program.refinement import refined
-from mampc.program.sample import Indices
 
 SLACK = 1e-12  # of the distance to go: how far a solver may miss a bound
 UNCERTAIN = 1e-10  # of the excess: what a solver's slack may be worth before the solution is refined
 VIOLATED = 1e-18  # in the solver's units: a violation up to here is rounding
 ROUNDING = 1e-15  # of what a sum adds up: how far it may be from the truth
+NEWTON = 30  # steps, until it is left at that
 DOUBTFUL = 1e4  # condition of R from which on the slack that a solver leaves is looked at
 
 
@@ -229,14 +229,6 @@ class LeastDistance:
         return np.asarray(~self._violations.any(axis=1))
 
     @cached_property
-    def _kinds(self) -> Indices:
-        """Which bounds share a violation, as a number each, shape (v + b,)."""
-        kinds = np.arange(self._v + len(self._rows))
-        rows, violations = np.nonzero(self._violations)
-        kinds[self._v + rows] = violations
-        return kinds
-
-    @cached_property
     def _within_firm(self) -> DaqpSolver:
         """The shortest moves within these, whatever violations are and whatever the cost is."""
         return DaqpSolver(QuadraticProgram(np.eye(len(self._R)), self._rows[self._firm], 0))
@@ -254,42 +246,58 @@ class LeastDistance:
         firm.start()
         if firm.solve(np.zeros(len(self._R)), low / scale, high / scale).status is QPStatus.INFEASIBLE:
             return Nearest(None, np.inf, None, QPStatus.INFEASIBLE, failed.iterations)
-        return self._refined(optimum, lower, upper, self._guess(lower, upper), failed.iterations)
+        return self._refined(optimum, lower, upper, self._guess(optimum, lower, upper), failed.iterations)
 
-    def _guess(self, lower: Array, upper: Array) -> Array:
-        """The signs of bounds that may be active: those that no moves break, and where these push moves.
+    def _guess(self, optimum: Array, lower: Array, upper: Array) -> Array:
+        """The signs of bounds that may be active: of the values outside their zones by Newton's method.
 
-        Of bounds that share a violation only the one that makes it largest. Far from zones as many bounds are active
-        as values count, and each that is not guessed takes a round.
+        Their errors are squares of the moves alone, once it is known on which side of its zone each value is. Far from
+        zones as many bounds are active as values count, and each that is not guessed would take a round.
         """
-        v, each, firm = self._v, np.abs(self._violations), self._firm
-        by = np.maximum(lower, -upper)[v:, None]
-        violations = np.divide(by, each, out=np.zeros(each.shape), where=(each > 0) & (by > 0))
-        signs, push = np.where(upper < 0, 1.0, np.where(lower > 0, -1.0, 0.0)), np.zeros(len(each))
-        for j in np.flatnonzero(violations.any(axis=0)).tolist():
-            row = int(violations[:, j].argmax())
-            push[row] = signs[v + row] * (self._cost.linear[j] + self._cost.curvature[j] * violations[row, j])
-        signs[v:][~firm] = np.sign(push[~firm])
-        along = np.sign(self._rows @ -(push @ self._rows))
-        within = np.where(along > 0, upper[v:] < UNBOUNDED, lower[v:] > -UNBOUNDED)
-        signs[v:][firm & within] = along[firm & within]
-        return signs
+        v, n, guess = self._v, self._limited, np.zeros(len(lower))
+        if n == v:
+            return guess
+        zone, j = np.nonzero(self._violations[:, n:])
+        low, high = lower[v + zone], upper[v + zone]
+        weight = np.sqrt(self._cost.curvature[n + j] / 2) / np.abs(self._violations[zone, n + j])
+        theta = np.hstack([np.zeros((len(zone), n)), self._rows[zone]])
+        F, c, A = self._squares(optimum, n)
+        others = np.delete(np.arange(len(A)), n + zone)
+        kept = others + np.where(others < n, 0, v - n)
+        pull: Array = np.zeros(len(others))
+        outside = np.where(high < 0, 1.0, np.where(low > 0, -1.0, 0.0))
+        for _ in range(NEWTON):
+            at = np.flatnonzero(outside)
+            squares = np.vstack([F, weight[at, None] * theta[at]])
+            target = np.concatenate([c, (weight * np.where(outside > 0, high, low))[at]])
+            found = refined(squares, target, A[others], lower[kept], upper[kept], pull)
+            if found is None:
+                break
+            pull, reached, before = found.multipliers, theta @ found.z, outside
+            outside = np.where(reached > high, 1.0, np.where(reached < low, -1.0, 0.0))
+            if (before == outside).all():
+                break
+        guess[kept], guess[v + zone] = pull, outside
+        return guess
+
+    def _squares(self, optimum: Array, n: int) -> tuple[Array, Array, Array]:
+        """F, c and the rows A of `refined` in the first n violations and the moves; A bounds these violations too."""
+        k, root = len(self._R), np.sqrt(self._cost.curvature[:n] / 2)
+        F, A = np.zeros((n + k, n + k)), np.zeros((n + len(self._rows), n + k))
+        F[:n, :n], F[n:, n:] = np.diag(root), self._R
+        A[:n, :n], A[n:, :n], A[n:, n:] = np.eye(n), self._violations[:, :n], self._rows
+        return F, np.concatenate([-0.5 * self._cost.linear[:n] / root, self._R.dot(optimum)]), A
 
     def _refined(
         self, optimum: Array, lower: Array, upper: Array, multipliers: Array, iterations: int
     ) -> Nearest:
         """The solution made exact from active bounds, those that multipliers tell; FAILED where that does not end."""
-        v, k, root = self._v, len(self._R), np.sqrt(self._cost.curvature / 2)
-        F, A = np.zeros((v + k, v + k)), np.zeros((len(lower), v + k))
-        F[:v, :v], F[v:, v:] = np.diag(root), self._R
-        A[:v, :v], A[v:, :v], A[v:, v:] = np.eye(v), self._violations, self._rows
-        reached = self._R.dot(optimum)
-        c = np.concatenate([-0.5 * self._cost.linear / root, reached])
-        better = refined(F, c, A, lower, upper, multipliers, self._kinds)
+        v = self._v
+        better = refined(*self._squares(optimum, v), lower, upper, multipliers)
         if better is None:
             return Nearest(None, np.inf, None, QPStatus.FAILED, iterations)
         moves = better.z[v:]
-        delta = self._R.dot(moves) - reached
+        delta = self._R.dot(moves) - self._R.dot(optimum)
         limited = self._limited
         excess, violated = float(delta.dot(delta)), bool(limited and better.z[:limited].max() > 0)
         if violated or v > limited:

@@ -6,8 +6,7 @@ A fast dual solver keeps bounds to a tolerance, and where rows are nearly parall
 do nearly the same) a little slack is worth a lot of cost. This is the dual method of Goldfarb and Idnani (Mathematical
 Programming 27, 1983) with every point worked out anew by the null-space method: with A_W' = Q R on the active bounds W,
 z = Q1 R^-T b + Q2 y, and y solves a least-squares problem of F Q2. So neither the condition of F is squared nor do
-steps add up rounding. The first rounds change all bounds at once that ask for it, which ends in a few where most of
-them are soft (Hintermüller, Ito, Kunisch, SIAM J. Optimization 13, 2002), but need not end.
+steps add up rounding.
 """
 
 from __future__ import annotations
@@ -17,13 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.program.sample import Indices
 
 BROKEN = 1e-11  # of the sizes in a row: a bound missed by more is not kept
 WRONG = 1e-11  # of the largest multiplier: one of the wrong sign by more is wrong
 NOISE = 1e-15  # of what a sum adds up: how far it may be from the truth
 DEPENDENT = 1e-12  # of a row's length: what others leave of it, when it says nothing new
-AT_ONCE = 20  # rounds that take up and leave out all bounds that seem to ask for it
 ROUNDS, ROUNDS_PER_VARIABLE = 100, 4  # until it is given up; each takes up one bound, or leaves one out
 
 
@@ -52,47 +49,32 @@ class Cost(NamedTuple):
         return cls(F, c, factor, optimum, np.abs(np.linalg.solve(factor, Q.T)) @ lost)
 
 
-def refined(
-    F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array, kinds: Indices | None = None
-) -> Refined | None:
-    """The optimum, from the active bounds that multipliers `pull` (rows,) tell; None if not found.
-
-    Of rows of one kind, shape (rows,), mostly one at a time is active; by default each is of its own.
-    """
-    kinds = np.arange(len(A)) if kinds is None else kinds
+def refined(F: Array, c: Array, A: Array, low: Array, high: Array, pull: Array) -> Refined | None:
+    """The optimum, from the active bounds that multipliers `pull` (rows,) tell; None if not found."""
     length = np.sqrt(np.square(A).sum(axis=1))
     length[length == 0] = 1.0
     A, low, high = A / length[:, None], low / length, high / length
     signs = {int(i): float(np.sign(pull[i])) for i in np.flatnonzero(pull)}
     cost = Cost.of(F, c)
-    for turn in range(ROUNDS + ROUNDS_PER_VARIABLE * len(F.T)):
+    for _ in range(ROUNDS + ROUNDS_PER_VARIABLE * len(F.T)):
         solved = _at(cost, A, low, high, signs)
         if solved is None:
             return None
         z, u, signs = solved
-        size = max((abs(value) for value in u.values()), default=0.0)
-        wrong = [i for i, value in u.items() if value < -WRONG * size]
+        size = max(u.values(), default=0.0)
+        wrong = min(u, key=lambda i: u[i], default=-1)
+        if wrong >= 0 and u[wrong] < -WRONG * max(size, -u[wrong]):
+            del signs[wrong]
+            continue
         rows = A @ z
         excess = np.maximum(rows - high, low - rows) - BROKEN * (np.abs(A) @ np.abs(z))
         excess[list(signs)] = -np.inf
-        if turn < AT_ONCE and (wrong or (excess > 0).any()):
-            broken = np.flatnonzero(excess > 0)
-            broken = broken[np.argsort(-excess[broken], kind="stable")]
-            broken = broken[np.unique(kinds[broken], return_index=True)[1]]
-            for i in wrong:
-                del signs[i]
-            for i in broken.tolist():
-                signs[i] = 1.0 if rows[i] > high[i] else -1.0
-            continue
-        if wrong:
-            del signs[min(wrong, key=lambda i: u[i])]
-            continue
-        worst = int(excess.argmax())
-        if excess[worst] <= 0:
+        if not (excess > 0).any():
             multipliers = np.zeros(len(A))
             for i, sign in signs.items():
                 multipliers[i] = sign * u[i]
             return Refined(z, multipliers / length)
+        worst = int(excess.argmax())
         if not _taken_up(
             cost.factor, A, signs, u, worst, 1.0 if rows[worst] > high[worst] else -1.0, excess[worst]
         ):
