@@ -16,6 +16,7 @@ from mampc.base.files import written_whole
 from mampc.compare.fronts import FEWEST, RATIOS, Estimate, Point, error_ratio, moves_at, non_dominated
 from mampc.compare.sweep import points_of
 from mampc.loop.drawing import looks
+from mampc.report.columns import numbers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,10 +59,8 @@ def front_tables(rows: Rows) -> Iterator[Table]:
     """Moves at equal error, one table a scenario."""
     for scenario in scenarios_of(rows):
         title = f"{scenario}: moves at equal error, in percent of plain MPC's (standard error)"
-        table = Table(title=title, title_justify="left")
-        table.add_column("controller")
-        for ratio in RATIOS:
-            table.add_column(f"{ratio:g} x MPC's error", justify="right")
+        headers = [f"{ratio:g} x MPC's error" for ratio in RATIOS]
+        table = Table("controller", *numbers(*headers), title=title, title_justify="left")
         for name, estimates in equal_error(rows, scenario).items():
             table.add_row(name, *(_shown(estimates[ratio]) for ratio in RATIOS))
         yield table

@@ -211,10 +211,10 @@ def fit_table(outcome: Outcome) -> Any:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table()
-    table.add_column("output")
-    for header in ("fit, estimation part (%)", "fit, hold-out part (%)", "whiteness of residuals (p)"):
-        table.add_column(header, justify="right")
+    from mampc.report.columns import numbers
+
+    headers = ("fit, estimation part (%)", "fit, hold-out part (%)", "whiteness of residuals (p)")
+    table = Table("output", *numbers(*headers))
     outputs, validation = outcome.model.names.outputs, outcome.validation
     rows = zip(outputs, outcome.fit, validation.fit, validation.whiteness, strict=True)
     for name, on_own, on_rest, p in rows:

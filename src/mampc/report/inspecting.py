@@ -21,14 +21,12 @@ SHOWN_POINTS = 3000  # of a column; more are drawn as the band between the least
 def inspection_table(seen: Inspection) -> Any:
     """One row a column."""
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table()
-    table.add_column("column")
-    table.add_column("unit")
-    for header in ("rows with a number", "least", "mean", "largest", "moves"):
-        table.add_column(header, justify="right")
-    table.add_column("movement", overflow="fold")
+    from mampc.report.columns import numbers
+
+    told = numbers("rows with a number", "least", "mean", "largest", "moves")
+    table = Table("column", "unit", *told, Column("movement", overflow="fold"))
     for column in seen.columns:
         known = column.values[~np.isnan(column.values)]
         figures = (

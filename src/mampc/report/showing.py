@@ -18,18 +18,15 @@ def model_tables(model: StateSpace) -> list[Any]:
     from rich.markup import escape
     from rich.table import Table
 
+    from mampc.report.columns import numbers
+
     found = properties(model)
     inputs, outputs = (*model.names.inputs, *model.names.disturbances), model.names.outputs
     deviation = gain_deviation(model, found)
     units = dict(model.names.units)
-    channels = Table(title="channels")
-    channels.add_column("output")
-    channels.add_column("input")
-    for header in ("gain", *(["± (standard deviation)"] if deviation is not None else [])):
-        channels.add_column(header, justify="right")
-    channels.add_column("unit")
-    for header in ("time constant", "dead time"):
-        channels.add_column(header, justify="right")
+    gains = numbers("gain", *(["± (standard deviation)"] if deviation is not None else []))
+    times = numbers("time constant", "dead time")
+    channels = Table("output", "input", *gains, "unit", *times, title="channels")
     for i, j in np.ndindex(found.gain.shape):
         if found.gain[i, j] == 0:
             continue
@@ -47,10 +44,7 @@ def model_tables(model: StateSpace) -> list[Any]:
         )
     if found.relative_gain is None or max(found.relative_gain.shape) < 2:
         return [channels]
-    relative = Table(title="relative gains")
-    relative.add_column("output")
-    for name in model.names.inputs:
-        relative.add_column(escape(name), justify="right")
+    relative = Table("output", *numbers(*map(escape, model.names.inputs)), title="relative gains")
     for name, row in zip(outputs, found.relative_gain, strict=True):
         relative.add_row(escape(name), *(f"{round(value, 2) + 0.0:.2f}" for value in row))
     return [channels, relative]

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
+from mampc.report.columns import numbers
 from mampc.study.schema import ControllerTable, PublishedTable, Study
 
 OUTSIDE = (("time_outside", ".0%"), ("mean_distance_outside", ".3g"))  # of zones: key and how it is shown
@@ -51,15 +52,7 @@ def baseline(study: Study) -> ControllerTable:
 def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
     base, zones = baseline(study), has_zones(study)
     samples = f"all {study.steps} samples" if part is None else f"without the first {study.skip} samples"
-    table = Table(
-        title=escape(f"{study.name}, {scenario['name']} — {samples}"),
-        title_justify="left",
-        title_style="bold",
-        caption=_caption(study, scenario),
-        caption_justify="left",
-    )
     published = any(_published(controller, part) for controller in study.controllers)
-    table.add_column("controller", no_wrap=True)
     headers = [
         f"changes\n> {study.threshold:g}",
         "changes\nat all",
@@ -70,8 +63,8 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
     headers += (
         ["published\nchanges", "published\nerror", f"published\n/ {escape(base.name)}"] if published else []
     )
-    for header in [*headers, "step\nµs"]:
-        table.add_column(header, justify="right", no_wrap=True)
+    caption = {"caption": _caption(study, scenario), "caption_justify": "left"}
+    table = _titled(study, scenario, samples, [*headers, "step\nµs"], **caption)
     entries = {entry["name"]: entry if part is None else entry[part] for entry in scenario["controllers"]}
     times = {entry["name"]: entry["solve_time_us"]["median"] for entry in scenario["controllers"]}
     largest = max(found["tracking_error"] for found in entries.values())
@@ -96,6 +89,13 @@ def _table(study: Study, scenario: dict[str, Any], part: str | None) -> Table:
     return table
 
 
+def _titled(study: Study, scenario: dict[str, Any], what: str, headers: list[str], **caption: Any) -> Table:
+    """A table without rows, of controllers and numbers."""
+    title = escape(f"{study.name}, {scenario['name']} — {what}")
+    columns = Column("controller", no_wrap=True), *numbers(*headers, no_wrap=True)
+    return Table(*columns, title=title, title_justify="left", title_style="bold", **caption)
+
+
 def _caption(study: Study, scenario: dict[str, Any]) -> str | None:
     """What the ratios of errors weigh, where outputs weigh differently, and who estimates how."""
     weighed = (
@@ -118,14 +118,8 @@ def _estimators(scenario: dict[str, Any]) -> str | None:
 
 def _wear_table(study: Study, scenario: dict[str, Any]) -> Table:
     """What the actuators bear, one value per input: of all samples."""
-    table = Table(
-        title=escape(f"{study.name}, {scenario['name']} — wear of the actuators"),
-        title_justify="left",
-        title_style="bold",
-    )
-    table.add_column("controller", no_wrap=True)
-    for header in ("travel", "reversals", "starts", "starts\nper hour", "of what\nis rated", "life\nyears"):
-        table.add_column(header, justify="right", no_wrap=True)
+    headers = ["travel", "reversals", "starts", "starts\nper hour", "of what\nis rated", "life\nyears"]
+    table = _titled(study, scenario, "wear of the actuators", headers)
     for entry in scenario["controllers"]:
         share, life = entry["share_of_rated_starts_per_input"], entry["life_years_per_input"]
         table.add_row(

@@ -12,6 +12,7 @@ from mampc.base.files import made_folder, written_whole
 from mampc.compare.fronts import Estimate
 from mampc.compare.tuned_study import MODEL_FILE
 from mampc.compare.tuning import Tuned
+from mampc.report.columns import numbers
 from mampc.report.fronts import front_figure, write_rows
 from mampc.report.output import save_figure
 from mampc.study.schema import Study
@@ -22,9 +23,8 @@ STUDY_FILE = "tuned.toml"
 
 def tuning_table(tuned: Tuned) -> Table:
     """The prices of the controller found, with moves and error."""
-    table = Table(title="The front: means (standard errors)", title_justify="left")
-    for column in ("price", "moves per hour", "error over plain MPC's"):
-        table.add_column(column, justify="right")
+    headers = ("price", "moves per hour", "error over plain MPC's")
+    table = Table(*numbers(*headers), title="The front: means (standard errors)", title_justify="left")
     for point in tuned.front:
         table.add_row(f"{point.price:.4g}", _shown(point.moves_per_hour), _shown(point.error_ratio))
     return table
