@@ -92,6 +92,25 @@ def test_loads_on_a_plant_that_runs_away_are_found_as_fast_as_elsewhere(model, p
     assert error[50:].max() < 0.05 * error.max()
 
 
+@pytest.mark.parametrize("disturbance", ["auto", "input"])
+def test_a_measured_disturbance_changes_no_gain_of_a_plant_that_runs_away(disturbance):
+    alone = two_outputs(1.05)
+    names = mampc.Names(("u1", "u2"), ("y1", "y2"), disturbances=("v",))
+    measured = mampc.StateSpace(
+        alone.A,
+        np.hstack([alone.B, [[0.3], [-0.1]]]),
+        alone.C,
+        np.zeros((2, 3)),
+        60.0,
+        v_op=[0.0],
+        names=names,
+    )
+    gains = [
+        mampc.KalmanFilter.offset_free(model, disturbance=disturbance).gain for model in (alone, measured)
+    ]
+    np.testing.assert_allclose(gains[1], gains[0], rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("pole", [0.99, 0.999, 1.0, 1.01])
 def test_a_wrong_gain_leaves_no_offset_either(pole):
     model = two_outputs(pole)

@@ -48,11 +48,12 @@ def response_within_reach(model: StateSpace) -> Array:
     It is the gain of what settles within that time, and finite for what does not. A mode that runs away counts as one
     that settles as fast (its pole p as 1/p), which is what feedback at least effort makes of it.
     """
+    m = model.n_inputs
     A, T, count = apart(model.A, lambda pole: abs(pole) > RUNAWAY)
     if count > 0:
         A[:count, :count] = np.linalg.inv(A[:count, :count])
         model = StateSpace(A, np.linalg.solve(T, model.B), model.C @ T, model.D, model.dt)
-    response = model.step_response(model.n_states + 2 * REACH + 1)[:, :, : model.n_inputs]
+    response = model.step_response(model.n_states + 2 * REACH + 1)[:, :, :m]
     before = np.concatenate([np.zeros((1, *response.shape[1:])), response])[: len(response)]
     change = np.concatenate([response[:1], response[REACH:] - before[:-REACH]])
     largest = np.abs(change).argmax(axis=0)
