@@ -15,7 +15,7 @@ from mampc.base.checks import Array, as_instance, as_read, as_shaped
 from mampc.base.errors import MampcError, MampcWarning
 from mampc.controllers.decision import Decision
 from mampc.loop.regulator import Regulator
-from mampc.loop.run import told_by
+from mampc.loop.run import DECIDED, decided_cells
 from mampc.loop.state import RegulatorState
 from mampc.loop.told import told_cells, told_columns
 from mampc.program.problem import Limits
@@ -67,8 +67,7 @@ class Recorder:
         self._writer.writerow([
             "time", *names.inputs, *names.disturbances,
             *(f"{y}_measured" for y in names.outputs), *(f"{y}_reference" for y in names.outputs),
-            "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored", "load",
-            "variant", *told_columns(names),
+            *DECIDED, *told_columns(names),
         ])  # fmt: skip
 
     def step(self, state: RegulatorState, y: Any, reference: Any, **told: Any) -> Decision:
@@ -118,8 +117,7 @@ class Recorder:
             self._samples * self._dt, *decision.u.tolist(),
             *as_shaped("measured_disturbance", v, self._shapes).tolist(),
             *as_shaped("y", y, (self._l,)).tolist(), *asked.tolist(),
-            decision.status.value, decision.objective, decision.lower_bound, decision.iterations,
-            round(decision.solve_time * 1e6, 2), *told_by(decision).values(),
+            *decided_cells(decision),
             *told_cells({"u_applied": u_applied, "manual": manual, "limits": limits}, self._m),
             ahead, "" if state is self._last else state.to_json(),
         ]  # fmt: skip

@@ -23,6 +23,9 @@ from mampc.loop.told import told_cells, told_columns
 from mampc.program.problem import Limits
 from mampc.program.zone import Zone
 
+DECIDED = (
+    "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored", "load", "variant",
+)  # fmt: skip
 ENDS = ("zone_low", "zone_high")  # of zones, in names of columns
 
 if TYPE_CHECKING:
@@ -138,9 +141,7 @@ class Run:
         inputs, outputs = self.names.inputs, self.names.outputs
         header = [
             "time", *inputs, *self.names.disturbances, *outputs,
-            *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs),
-            "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored",
-            "load", "variant",
+            *(f"{y}_measured" for y in outputs), *(f"{y}_reference" for y in outputs), *DECIDED,
         ]  # fmt: skip
         numbers = np.hstack([self.t[:, None], self.u, self.v, self.y, self.y_measured, self.r]).tolist()
         positions: list[list[Any]] = [[] for _ in self.t]
@@ -158,11 +159,15 @@ class Run:
         with written_whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)
-            for row, d, position in zip(numbers, self.decisions, positions, strict=True):
-                writer.writerow([
-                    *row, d.status.value, d.objective, d.lower_bound, d.iterations,
-                    round(d.solve_time * 1e6, 2), *told_by(d).values(), *position,
-                ])  # fmt: skip
+            for row, decision, position in zip(numbers, self.decisions, positions, strict=True):
+                writer.writerow([*row, *decided_cells(decision), *position])
+
+
+def decided_cells(decision: Decision) -> list[Any]:
+    """What a file holds of a decision beside its inputs, in the columns `DECIDED`."""
+    d = decision
+    told = d.status.value, d.objective, d.lower_bound, d.iterations, round(d.solve_time * 1e6, 2)
+    return [*told, *told_by(d).values()]
 
 
 def told_by(decision: Decision) -> dict[str, str]:
