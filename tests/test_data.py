@@ -149,7 +149,7 @@ def test_a_file_that_is_no_record_is_refused_with_the_place(tmp_path, text, mess
 def test_missing_files_directories_and_other_formats_are_refused(tmp_path):
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
     for name in ("missing.csv", "picture.png", ""):
-        with pytest.raises(MampcError, match="expected a readable CSV, Excel or Parquet file"):
+        with pytest.raises(MampcError, match="expected a readable CSV, Excel, Parquet or JSON file"):
             IOData.from_csv(tmp_path / name, inputs=["u"], outputs=["y"])
 
 

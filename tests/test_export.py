@@ -47,6 +47,16 @@ def test_thousands_are_read_where_no_doubt_is_left(tmp_path):
         np.testing.assert_allclose(record.u[:, 0], U * factor)
 
 
+def test_points_that_may_group_thousands_are_refused_where_whole_numbers_stand_beside_them(tmp_path):
+    grouped = [f"{1000 * k - 64:,}".replace(",", ".") for k in range(len(U))]
+    content = text(rows(u=100 * U, y=grouped), ";")
+    with pytest.raises(MampcError, match="may be grouped thousands; pass decimal"):
+        read(tmp_path, text(rows(u=["1"] * len(U), y=grouped), ";"))
+    assert read(tmp_path, content.replace(".0;", ";"), decimal=",").records[0].y[1, 0] == 936
+    whole = text(rows(u=["1"] * len(U), y=[*grouped[:-1], "12345"]), ";")
+    assert read(tmp_path, whole).records[0].y[2, 0] == 1.936  # whole numbers are not grouped
+
+
 def test_two_ways_to_write_decimals_in_one_file_are_refused(tmp_path):
     lines = rows()
     lines[4][2] = "1,5"
@@ -284,7 +294,7 @@ def test_short_gaps_are_closed_only_where_asked_and_told(tmp_path, column):
     [
         ({"decimal": ";"}, "decimal: expected"),
         ({"time": "when"}, "time: expected a column of the file, received 'when'"),
-        ({"time_unit": "week"}, "time_unit: expected one of"),
+        ({"time_unit": "fortnight"}, "time_unit: expected one of"),
         ({"time_zone": "Mars/Olympus"}, "time_zone: expected a name"),
         ({"time_format": "%d.%m.%Y"}, "expected times in column 'time'"),
         ({"ranges": {"z": (0, 1)}}, "ranges: expected names among"),

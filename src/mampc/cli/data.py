@@ -23,7 +23,7 @@ Disturbances = Annotated[str, typer.Option(help="Columns of inputs that are meas
 @app.command()
 @reads_exports
 def inspect(
-    export: Annotated[Path, typer.Argument(help="CSV, Excel or Parquet file.")],
+    export: Annotated[Path, typer.Argument(help="CSV, Excel, Parquet or JSON file.")],
     inputs: Inputs = "",
     outputs: Outputs = "",
     disturbances: Disturbances = "",
@@ -80,7 +80,7 @@ def inspect(
 @app.command()
 @reads_exports
 def identify(
-    exports: Annotated[list[Path], typer.Argument(help="CSV, Excel or Parquet files of one plant.")],
+    exports: Annotated[list[Path], typer.Argument(help="CSV, Excel, Parquet or JSON files of one plant.")],
     inputs: Inputs,
     outputs: Outputs,
     disturbances: Disturbances = "",

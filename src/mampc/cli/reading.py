@@ -20,7 +20,7 @@ def reading_options(
     ] = None,
     time: Annotated[str | None, typer.Option("--time", help="Column of times; default found.")] = None,
     time_unit: Annotated[
-        str | None, typer.Option(help="Of times that are numbers: ms, s, min, h or d.")
+        str | None, typer.Option(help="Of times that are numbers: ns, us, ms, s, min, h or d.")
     ] = None,
     time_format: Annotated[
         str | None, typer.Option(help="Of time stamps, as strptime has it, such as '%d/%m/%Y %H:%M'.")

@@ -96,7 +96,7 @@ class IOData:
         dt: float | None = None,
         **options: Unpack[ReadingOptions],
     ) -> IOData:
-        """Read the named columns of an export without gaps: CSV in its many forms, Excel or Parquet.
+        """Read the named columns of an export without gaps: CSV in its many forms, Excel, Parquet or JSON.
 
         See `read_export`, which takes the same arguments, returns the pieces where gaps split a record, and
         lists what it noticed; here, a warning says where samples are not simply what stands in the rows.

@@ -17,6 +17,7 @@ from mampc.identification.export.findings import MOST_SHOWN, Findings, rows_text
 STRAYING = 0.01  # of dt: rows whose times stray less from even steps are taken as even
 GAP = 1.5  # of dt between rows
 SAME_STEP = 0.01  # relative: a dt given and one read that differ by more contradict each other
+MOST_SHIFTS = 3  # uneven steps that say that the clock was set, and nothing of the sample time
 UNEVEN = 0.3  # of the usual step: one that far from any whole number of usual steps is uneven
 MOST_UNEVEN = 0.2  # of all steps; where more are uneven, the record has no sample time
 MOST_GAPS = 1 / 3  # of all steps
@@ -253,6 +254,8 @@ def _step(seconds: Array, clock: Clock, numbers: npt.NDArray[np.int64], findings
         return None
     # The mean over the longest runs without a gap: jitter of single rows cancels.
     together = steps <= GAP * usual
+    if uneven.sum() <= MOST_SHIFTS:
+        together &= ~uneven
     edges = np.flatnonzero(np.diff(np.concatenate(([False], together, [False])).astype(int)))
     begins, ends = edges[::2], edges[1::2]
     mean = float(np.sum(seconds[ends] - seconds[begins]) / np.sum(ends - begins))

@@ -340,4 +340,25 @@ def _decimal_mark(sheet: Sheet, columns: Sequence[int], findings: Findings) -> s
         findings.doubt(
             f"numbers such as {either!r} may have a decimal comma or grouped thousands; pass decimal (--decimal)"
         )
+    elif sheet.separator not in (None, ",") and _whole_beside_grouped(sheet, columns):
+        findings.doubt(
+            f"numbers such as {either!r} stand beside whole ones below a thousand and none above: they may be grouped "
+            "thousands; pass decimal (--decimal)"
+        )
     return "."
+
+
+def _whole_beside_grouped(sheet: Sheet, columns: Sequence[int]) -> bool:
+    """Whether a column holds both 7.198 and 64, and none holds 7198."""
+    found: list[set[str]] = [set() for _ in columns]
+    for part in sheet.chunks(columns):
+        for kinds, cells in zip(found, part, strict=True):
+            for cell in cells if isinstance(cells, list) else ():
+                word = without_unit(clean(cell))[0].lstrip("+-")
+                if EITHER.fullmatch(word):
+                    kinds.add("either")
+                elif word.isdigit() and len(word) > 1:
+                    kinds.add("small" if len(word) < 4 else "large")
+    return any({"either", "small"} <= kinds for kinds in found) and not any(
+        "large" in kinds for kinds in found
+    )

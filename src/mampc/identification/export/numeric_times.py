@@ -7,16 +7,27 @@ import re
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.base.errors import shown
 from mampc.identification.export.cells import POINT, clean, without_unit
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.sheet import Sheet
 from mampc.identification.export.stamps import SECONDS, TimeReading, unevenness
 
 LATEST = 4.2e9  # seconds: larger numbers are hardly seconds
+# What programs count since when: how many a second, and between which numbers the years 1994 to 2100 lie.
+COUNTS = (
+    ("milliseconds since 1970", 1e3, 0.75e12, LATEST * 1e3),
+    ("microseconds since 1970", 1e6, 0.75e15, LATEST * 1e6),
+    ("nanoseconds since 1970", 1e9, 0.75e18, LATEST * 1e9),
+    ("100 ns since 1601, as Windows counts", 1e7, 1.24e17, 1.58e17),
+    ("100 ns since the year 1, as .NET counts", 1e7, 6.29e17, 6.63e17),
+    ("millionths of a day since 1900, as WinCC counts", 1e6 / 86400, 3.43e10, 7.31e10),
+)
 DAYS = ((36526.0, 73051.0), (730486.0, 767011.0))  # 2000 to 2100, counted as spreadsheets and as MATLAB do
 # Seconds between samples that people choose; as parts of an hour or a day they are no round numbers.
 USUAL = np.array([1, 2, 5, 10, 15, 20, 30, 60, 120, 180, 300, 600, 900, 1200, 1800, 3600, 7200])
 WORDS_ONLY_ALONE = ("day", "second")  # "time of day" says nothing of a unit
+WORDS_ONLY_LAST = ("us", "ns")  # nor does "US time"
 
 
 def from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) -> Array:
@@ -32,11 +43,15 @@ def from_numbers(sheet: Sheet, at: int, how: TimeReading, findings: Findings) ->
     least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     usual = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
     digits = _digits_of_a_clock(known)
-    for size, unit_name in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
-        if LATEST * 0.1 * size < most < LATEST * size and not digits:
-            findings.note(f"times in column {name!r} are taken as {unit_name} since 1970")
+    for counted, size, first, last in COUNTS:
+        if first < most < last and not digits:
+            findings.note(f"times in column {name!r} are taken as {counted}")
             return (values - least) / size + least / size
-    if most > LATEST:
+    if unit and most < COUNTS[0][2] / 1e3:
+        findings.doubt(
+            f"times in column {name!r} are in {shown(unit)}; expected one of ns, us, ms, s, min, h, d (--time-unit)"
+        )
+    elif most > LATEST:
         findings.doubt(
             f"times in column {name!r} are numbers as large as {most:.15g}; pass their unit (--time-unit) or their "
             "format (--time-format '%Y%m%d%H%M%S')"
@@ -83,7 +98,13 @@ def _unit(sheet: Sheet, at: int) -> str:
     """The unit under or behind a name, or the last word of it that is one, such as in "Elapsed minutes"."""
     unit = sheet.units.get(at, "").casefold().rstrip(".")
     words = re.findall(r"[^\W\d_]+", sheet.header[at].casefold())
-    named = [word for word in words if word in SECONDS and (word not in WORDS_ONLY_ALONE or len(words) == 1)]
+    named = [
+        word
+        for word in words
+        if word in SECONDS
+        and (word not in WORDS_ONLY_ALONE or len(words) == 1)
+        and (word not in WORDS_ONLY_LAST or word == words[-1])
+    ]
     return unit or (named[-1] if named else "")
 
 

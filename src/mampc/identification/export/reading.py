@@ -45,7 +45,7 @@ def read_export(
     dt: float | None = None,
     **options: Unpack[ReadingOptions],
 ) -> Export:
-    """Read the named columns of an export: CSV in its many forms, Excel, Parquet, or a pandas DataFrame.
+    """Read the named columns of an export: CSV in its many forms, Excel, Parquet, JSON, or a pandas DataFrame.
 
     No number is made of a mark for a missing or bad value, no gap is closed, and no sample time is changed: rows
     without a complete set of values are left out, and gaps split the record.

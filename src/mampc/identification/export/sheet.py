@@ -1,4 +1,4 @@
-"""Rows of cells under a header, whether they come from text, a spreadsheet, a Parquet file or a data frame."""
+"""Rows of cells under a header, whether they come from text, a spreadsheet, a Parquet or JSON file or a data frame."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from mampc.identification.export.header import (
     require_columns,
     without_empty_end,
 )
+from mampc.identification.export.json_text import is_json, read_json
 from mampc.identification.export.survey import Survey, stripped
 from mampc.identification.export.text import FILE_LIMIT, KIND, ZIP, Rows, encoding_of, text_rows, unpacked
 from mampc.identification.export.workbook import read_parquet, read_workbook
@@ -104,6 +105,8 @@ def open_sheet(source: Any, names: Sequence[str], findings: Findings, encoding: 
     content = unpacked(source, read_bounded(source, FILE_LIMIT, KIND), findings)
     if content.startswith(b"PAR1"):
         return frame_sheet(read_parquet(source, content), names, findings)
+    if is_json(content):
+        return frame_sheet(read_json(source, content), names, findings)
     if content.startswith(ZIP):
         worksheets = read_workbook(source, content, findings)
         return _row_sheet([(rows, None, title) for title, rows in worksheets], names, findings)

@@ -20,6 +20,8 @@ from mampc.identification.export.findings import Findings
 from mampc.identification.export.sheet import Cells, Sheet
 
 SECONDS = {
+    "ns": 1e-9, "nanoseconds": 1e-9,
+    "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "microseconds": 1e-6,
     "ms": 1e-3, "msec": 1e-3, "milliseconds": 1e-3,
     "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0,
     "min": 60.0, "minute": 60.0, "minutes": 60.0,
@@ -29,8 +31,17 @@ SECONDS = {
     "minuti": 60.0, "stunden": 3600.0, "heures": 3600.0, "horas": 3600.0, "ore": 3600.0, "tage": 86400.0,
 }  # fmt: skip
 DATE_ONLY = re.compile(r"\d+[-/.]\w+[-/.]\d+|\w+ \w+,? \d+")
-OFFSET = re.compile(r".*\d(Z|[+-]\d\d(:?\d\d)?)")
-TIMES = ("", " %H:%M:%S", " %H:%M", " %H:%M:%S.%f", " %I:%M:%S %p", " %I:%M %p", " %I:%M:%S.%f %p")
+OFFSET = re.compile(r".*(?:\d|[AaPp][Mm])(Z|[+-]\d\d(:?\d\d)?)")
+TIMES = (
+    "",
+    " %H:%M:%S",
+    " %H:%M",
+    " %H:%M:%S.%f",
+    " %H:%M:%S:%f",
+    " %I:%M:%S %p",
+    " %I:%M %p",
+    " %I:%M:%S.%f %p",
+)
 # Dates, in each order of day and month that they may have.
 ORDERS = {
     "day": (
@@ -38,7 +49,7 @@ ORDERS = {
         "%d-%b-%Y", "%d-%b-%y", "%d %b %Y", "%d %b %y", "%d/%b/%Y", "%d %B %Y",
     ),
     "month": ("%m/%d/%Y", "%m-%d-%Y", "%m/%d/%y", "%m-%d-%y", "%b %d %Y", "%B %d %Y"),
-    "year": ("ISO8601", "%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d"),
+    "year": ("ISO8601", "%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%y/%m/%d", "%y-%m-%d", "%y.%m.%d", "%G-W%V-%u"),
 }  # fmt: skip
 MOST_FORMATS = 4  # in one column, such as with and without fractions of seconds
 PLAIN = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d{1,6})?)?", re.ASCII)
@@ -56,7 +67,7 @@ class TimeReading:
 
     Args:
         time: its name; None to find it.
-        time_unit: of numbers, "ms", "s", "min", "h" or "d"; None to see it from the header, else seconds.
+        time_unit: of numbers, "ns", "us", "ms", "s", "min", "h" or "d"; None to see it from the header, else seconds.
         time_format: of stamps, as in `strptime`, such as "%d/%m/%Y %H:%M"; None to see it from the cells.
         time_zone: of stamps in local time, such as "Europe/Berlin"; None where the clock is never changed.
     """
@@ -68,7 +79,9 @@ class TimeReading:
 
     def __post_init__(self) -> None:
         if self.time_unit is not None and self.time_unit not in SECONDS:
-            raise MampcError(f"time_unit: expected one of ms, s, min, h, d, received {shown(self.time_unit)}")
+            raise MampcError(
+                f"time_unit: expected one of ns, us, ms, s, min, h, d, received {shown(self.time_unit)}"
+            )
         if self.time_zone is not None:
             from zoneinfo import ZoneInfo
 
@@ -126,12 +139,13 @@ def from_stamps(
                     "spreadsheets make them of dates of another country; export them again, with the year first"
                 )
     elif likely:
-        one, other_one, *_ = found.values()
-        if np.array_equal(one, other_one, equal_nan=True):
-            findings.note(f"{words} may have the day or the month first; the steps are the same")
-        elif max(strays.values()) < 1.05 * strays[choice] + 0.01:
+        others = [k for k in found if not np.array_equal(found[k], found[choice], equal_nan=True)]
+        either = " or ".join(f"the {key}" for key in likely)
+        if not others:
+            findings.note(f"{words} may have {either} first; the steps are the same")
+        elif min(strays[key] for key in others) < 1.05 * strays[choice] + 0.01:
             findings.doubt(
-                f"{words} may have the day or the month first; pass their format (--time-format '%d/%m/%Y %H:%M:%S')"
+                f"{words} may have {either} first; pass their format (--time-format '%d/%m/%Y %H:%M:%S')"
             )
         else:
             findings.note(f"{words} have the {choice} first: only so are they even")

@@ -28,7 +28,7 @@ class ReadingOptions(TypedDict, total=False):
     """How an export is read, where that is not plain from the file; messages say which one they miss.
 
     time: column of times; default found.
-    time_unit: of times that are numbers: "ms", "s", "min", "h" or "d".
+    time_unit: of times that are numbers: "ns", "us", "ms", "s", "min", "h" or "d".
     time_format: of time stamps, as in `strptime`.
     time_zone: of local time stamps, such as "Europe/Berlin".
     decimal: "." or ",".

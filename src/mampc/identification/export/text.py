@@ -21,7 +21,7 @@ from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import NOT_UTF_8, Row
 
 FILE_LIMIT = 256 * 2**20  # bytes
-KIND = "CSV, Excel or Parquet file"
+KIND = "CSV, Excel, Parquet or JSON file"
 CHUNK = 20_000  # rows parsed at a time
 MARK = "\ufeff"  # of the order of bytes, inside a text where files were put together
 BINARY = re.compile(rb"[\x00-\x08\x0e-\x19\x1c-\x1f]|\x1a(?!\s*$)")
