@@ -73,10 +73,8 @@ class StateSpace:
         B = as_matrix("B", self.B, n)
         C = as_matrix("C", self.C, None, n)
         columns, l = B.shape[1], C.shape[0]
-        names = (
-            Names.numbered(columns, l, n) if self.names is None else as_instance("names", self.names, Names)
-        )
-        d = len(names.disturbances)
+        names = Names.numbered(columns, l, n) if self.names is None else self.names
+        d = len(as_instance("names", names, Names).disturbances)
         m = columns - d
         if m <= 0 or l == 0:
             raise MampcError(f"StateSpace: expected at least one input and output, received {m} and {l}")
@@ -95,9 +93,8 @@ class StateSpace:
         }  # fmt: skip
         if self.noise is not None and as_instance("noise", self.noise, Noise).output.shape != (l,):
             raise MampcError(f"noise: expected {l} outputs, received {self.noise.output.size}")
-        if self.evidence is not None and not as_instance("evidence", self.evidence, Evidence).matches(
-            l, columns
-        ):
+        said = self.evidence
+        if said is not None and not as_instance("evidence", said, Evidence).matches(l, columns):
             raise MampcError(f"evidence: expected {columns} inputs and {l} outputs, received other numbers")
         for name, value in checked.items():
             if isinstance(value, np.ndarray):
@@ -359,8 +356,7 @@ class StateSpace:
         time of unstated length and its dt = None leaves the kind of time open.
 
         Args:
-            system: the object. Transfer functions of python-control may have many inputs and outputs; their
-                channels are realised one by one, and what is redundant is left out.
+            system: transfer functions of python-control may have many inputs and outputs.
             dt: wanted sample time in seconds. A continuous system is sampled (zero-order hold), an
                 unstated sample time is taken to be this one, a stated one must agree.
 
