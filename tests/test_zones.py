@@ -336,15 +336,16 @@ def test_small_move_weights_leave_the_optimum_what_it_is():
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
-@pytest.mark.parametrize("rate", [-0.1, -1.4, -10.0])
+@pytest.mark.parametrize("rate", [-0.1, -1.4])
 def test_outputs_that_run_far_away_from_their_zones_leave_the_optimum_what_it_is(rate, unit):
-    """A triple integrator: over a long horizon its errors are some 1e5 times what moves cost."""
+    """A triple integrator: over a long horizon its errors are some 1e5 times what moves cost; with a limit too."""
     model = mampc.StateSpace(
         [[1, 1, 0.5], [0, 1, 1], [0, 0, 1]], [[1 / 6], [0.5], [1]], [[unit, 0, 0]], None, 1.0
     )
     problem = mampc.TrackingProblem(
         model, prediction_horizon=110, control_horizon=4, output_weight=unit**-2, move_weight=1.0,
-        limits=mampc.Limits(u_min=-0.1, u_max=0.1), zone_below=0.03 * unit, zone_above=0.03 * unit,
+        limits=mampc.Limits(u_min=-0.1, u_max=0.1, y_min=-0.5 * unit if unit > 1 else None),
+        zone_below=0.03 * unit, zone_above=0.03 * unit,
     )  # fmt: skip
     controller, x = mampc.MAMPC(problem, mampc.MoveRules(max_moves=1)), np.array([0.1, -0.35, rate])
     decision = controller.step(controller.initial_state(), x, np.zeros(1))
