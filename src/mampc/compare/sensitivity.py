@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from mampc.study.regulators import regulator_of
 from mampc.study.running import Prepared, prepare, run_controller
 from mampc.study.scenario_tables import ScenarioTable
@@ -133,7 +135,7 @@ def varied(
         return study.model_copy(update={"dt": value}), scenario, sparse
     if setting == "reference":
         changes = [
-            change.model_copy(update={"value": _scaled(change.value, value)})
+            change.model_copy(update={"value": (np.asarray(change.value) * value).tolist()})
             for change in study.reference.changes
         ]
         return within(study, "reference", changes=changes), scenario, sparse
@@ -142,10 +144,6 @@ def varied(
     if setting == "penalty":
         return study, scenario, sparse.model_copy(update={"settings": sparse.settings | {"penalty": value}})
     return study, scenario, within(sparse, "rules", **{setting: int(value)})
-
-
-def _scaled(values: Any, factor: float) -> Any:
-    return [value * factor for value in values] if isinstance(values, list) else values * factor
 
 
 def holding(points: list[Point], most_error: float) -> Iterator[Point]:

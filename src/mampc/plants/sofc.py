@@ -180,7 +180,7 @@ class SolidOxideFuelCell:
             gases = flow[..., 2 * side : 2 * side + 2]
             total = gases.sum(axis=-1, keepdims=True)
             fractions = gases / total
-            mass = (fractions * self._masses(side)).sum(axis=-1, keepdims=True)
+            mass = (fractions * self.molar_masses[2 * side : 2 * side + 2]).sum(axis=-1, keepdims=True)
             head = (total / self._orifice(side)) ** 2 * self.gas_constant * self.temperature * mass / 2
             pressure = self.atmosphere / 2 + np.sqrt(self.atmosphere**2 / 4 + head)
             pressures.append(fractions * pressure)
@@ -225,6 +225,3 @@ class SolidOxideFuelCell:
     def _orifice(self, side: int) -> float:
         area = (self.anode_orifice, self.cathode_orifice)[side]
         return self.discharge_coefficient / float((1 - self.diameter_ratio**4) ** 0.5) * area
-
-    def _masses(self, side: int) -> Array:
-        return np.array(self.molar_masses[2 * side : 2 * side + 2])

@@ -49,9 +49,10 @@ def study_figures(result: StudyResult) -> Iterator[Drawing]:
         yield from _excitation(result.data)
     look = result_looks(result)
     limits = result.study.problem.limits
+    length = f"{result.study.steps} samples of {result.study.dt:g} s"
     for scenario, runs in result.runs.items():
         names = next(iter(runs.values())).names
-        word, where = file_word(scenario), f"scenario {scenario}, {_length(result)}"
+        word, where = file_word(scenario), f"scenario {scenario}, {length}"
         yield Drawing(
             f"{word}_overview",
             f"All outputs and inputs, {where}.",
@@ -212,7 +213,3 @@ def _record_figure(data: IOData, signals: tuple[str, ...], values: Array, stairc
         axes[-1, 0].set_xlabel(f"time ({unit})")
         axes[-1, 0].set_xlim(0, time[-1] / scale or None)
     return figure
-
-
-def _length(result: StudyResult) -> str:
-    return f"{result.study.steps} samples of {result.study.dt:g} s"

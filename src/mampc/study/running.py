@@ -219,7 +219,8 @@ def _acting(study: Study, prepared: Prepared, scenario: ScenarioTable) -> dict[s
     model = prepared.model
 
     def disturbance(value: Values | None, usual: Any) -> Any:
-        return None if value is None else _disturbance(study, scenario, value, usual)
+        with said_at(f"scenarios, {scenario.name!r}, disturbances: "):
+            return None if value is None else steps(study.steps, usual, [(scenario.disturbance_at, value)])
 
     return {
         "reference": _asked(study, prepared),
@@ -272,12 +273,6 @@ def load_of(study: Study, model: StateSpace, table: LoadTable) -> Load:
     )  # fmt: skip
     residuals = Residuals.of(model, record)
     return residuals if table.at is None else replace(residuals, at=table.at)
-
-
-def _disturbance(study: Study, scenario: ScenarioTable, value: Values, usual: Any) -> Array:
-    """A disturbance that takes a value at the scenario's sample, one row per sample."""
-    with said_at(f"scenarios, {scenario.name!r}, disturbances: "):
-        return steps(study.steps, usual, [(scenario.disturbance_at, value)])
 
 
 def _operating_point(study: Study, plant: Plant | StateSpace) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ from mampc.identification.export.daytime import (
 from mampc.identification.export.findings import Findings, rows_text
 from mampc.identification.export.header import find_column
 from mampc.identification.export.numeric_times import from_numbers
-from mampc.identification.export.sheet import Cells, Sheet
+from mampc.identification.export.sheet import Sheet
 from mampc.identification.export.stamps import (
     DATE_ONLY,
     TimeReading,
@@ -196,7 +196,8 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
     found = [
         at for at in found if len(set(sheet.first(at))) > 1
     ] or found  # others hold the export's own span
-    if len(found) > 1 and _all_alike([sheet.column(at) for at in found]):
+    columns = [list(sheet.column(at)) for at in found] if len(found) > 1 else []
+    if columns and all(column == columns[0] for column in columns):
         findings.note(f"{len(found)} columns of times are the same, as {sheet.header[found[0]]!r}")
     elif len(found) > 1 and len({sheet.header[at] for at in found}) == 1:
         findings.doubt(
@@ -211,10 +212,6 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
     if not found and free[:1] == [0] and _runs_on(sheet, 0, 0.9, evenly=True):
         return (0,)
     return tuple(found[:1])
-
-
-def _all_alike(columns: Sequence[Cells]) -> bool:
-    return all(list(column) == list(columns[0]) for column in columns[1:])
 
 
 def _share(cells: Sequence[str], test: Callable[[str], Any]) -> float:

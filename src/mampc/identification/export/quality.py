@@ -61,7 +61,7 @@ def quality_columns(
             general.setdefault(_plain(header[at]), []).append(at)
     at_position = {position: name for name, position in columns.items()}
     for places in general.values():
-        side = 1 if places[0] == 0 or not _holds_values(sheet, places[0] - 1) else -1
+        side = 1 if places[0] == 0 or not says_numbers(sheet.first(places[0] - 1)) else -1
         for at in places:
             if len(places) == 1:
                 found[at] = tuple(columns)
@@ -111,10 +111,6 @@ def _is_general(sheet: Sheet, at: int) -> bool:
         return TRUE_OR_FALSE.issuperset(cells)
     filled = [cell for cell in cells if cell]
     return bool(filled) and all(SPOKEN.fullmatch(cell) for cell in filled)
-
-
-def _holds_values(sheet: Sheet, at: int) -> bool:
-    return says_numbers(sheet.first(at))
 
 
 def _speaks_of_any(header: Sequence[str], at: int) -> bool:
