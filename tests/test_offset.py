@@ -142,6 +142,8 @@ def test_under_noise_and_steady_loads_the_mean_offset_is_within_it(seed):
     l = problem.model.n_outputs
     regulator = counting(problem, float(10 ** rng.uniform(-2, 0)), 0.1)
     bound = regulator.largest_offset()
+    if np.isinf(bound).any():  # of a tail that is too short for any
+        return
     for size in (0.9, 1.5):
         reference = np.tile(problem.model.y_op, (200, 1))
         reference[5:] += size * bound * rng.choice([-1, 1], l)
