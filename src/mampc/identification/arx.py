@@ -15,6 +15,7 @@ from mampc.base.checks import Array
 from mampc.identification.delays import Integers
 from mampc.identification.drift import high_passed
 from mampc.identification.estimate import PROJECTED, Settings, finished
+from mampc.identification.output_error import least_output_error
 from mampc.identification.parts import Part, records_of_part
 from mampc.identification.prewhitening import denominator, prewhitened, refined
 from mampc.identification.scaling import Scaled
@@ -47,7 +48,9 @@ def estimate_arx(
 
         def dynamics(n: int, seen: Scaled) -> tuple[Array, Array]:
             found = denominator(seen.u, seen.y, n, PROJECTED[trend], first)
-            return _companion(refined(found, seen, first) if trend == "whitened" else found)
+            if trend == "whitened":
+                found = least_output_error(refined(found, seen, first), seen, first)
+            return _companion(found)
 
         tried = range(1, most + 1) if orders is None else (orders[i],)
         parts.append(finished(dynamics, tried, own, seen, (i,), row, settings, trend))

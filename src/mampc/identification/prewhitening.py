@@ -15,13 +15,13 @@ from dataclasses import replace
 import numpy as np
 
 from mampc.base.checks import Array
+from mampc.identification.output_error import stable
 from mampc.identification.scaling import Scaled
 from mampc.identification.triangular import fold, solve
 
 LONGEST = 30  # coefficients of the filter
-ITERATIONS = 20
+ITERATIONS = 5
 SETTLED = 1e-6  # change of a coefficient
-EDGE = 1 - 1e-9  # largest pole
 SHORTEST = 8  # samples of a record, of which the filter takes a quarter
 _CHUNK = 4096  # equations at once
 EACH = 20  # samples for each coefficient of the ARX model, at least
@@ -77,27 +77,18 @@ def refined(a: Array, records: Scaled, first: int) -> Array:
     """
     from scipy.signal import lfilter
 
-    a = _stable(a)
+    a = stable(a)
     for _ in range(ITERATIONS):
         recursion = np.concatenate([[1.0], -a])
         u, y = (
             [lfilter([1.0], recursion, signal, axis=0) for signal in signals]
             for signals in (records.u, records.y)
         )
-        found = _stable(denominator(u, y, len(a), 0, first))
+        found = stable(denominator(u, y, len(a), 0, first))
         if np.abs(found - a).max() < SETTLED:
             return found
         a = found
     return a
-
-
-def _stable(a: Array) -> Array:
-    """Poles outside the unit circle mirrored to its inside."""
-    poles = np.roots(np.concatenate([[1.0], -a]))
-    size = np.maximum(np.abs(poles), 1e-300)
-    inside = np.where(size > EDGE, poles / size * np.minimum(1 / size, EDGE), poles)
-    stable: Array = -np.real(np.poly(inside))[1:]
-    return np.concatenate([stable, np.zeros(len(a) - len(stable))])  # leading zeros have no roots
 
 
 def filtered_by(signal: Array, a: Array) -> Array:
