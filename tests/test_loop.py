@@ -249,10 +249,22 @@ def test_arguments_that_do_not_fit_together_are_refused(options):
         mampc.simulate(plant, regulator(stable_model()), reference, **arguments)
 
 
-def test_a_decision_cannot_be_changed_behind_the_loops_back():
-    loop = mampc.Regulator(mampc.MPC(tank_problem()))
-    decision = loop.step(loop.initial_state(), tank_problem().model.y_op, tank_problem().model.y_op)
-    for array in (decision.u, decision.plan, decision.changes):
+def controllers_of_all_kinds():
+    problem = tank_problem()
+    yield mampc.MPC(problem)
+    yield mampc.rivals.DeadBand(mampc.MPC(problem), size=1.0)
+    for rules in (mampc.MoveRules(price=1.0), mampc.MoveRules(max_moves=3, sparsity_horizon=3)):
+        for method in mampc.METHODS:
+            yield mampc.MAMPC(problem, rules, method=method)
+
+
+@pytest.mark.parametrize("controller", [*controllers_of_all_kinds()])
+def test_a_decision_cannot_be_changed_behind_the_loops_back(controller):
+    loop, y_op = mampc.Regulator(controller), controller.problem.model.y_op
+    decision = loop.step(loop.initial_state(), y_op, y_op + 2.0)
+    for array in (
+        decision.u, decision.plan, decision.changes, decision.violations, decision.state.controller.inputs,
+    ):  # fmt: skip
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 99.0
 

@@ -310,9 +310,6 @@ class Controller(ABC):
             objective = self.condensed.cost(sample, moves) + self._charge(moves, sample)
         if violations is None and self.condensed.n_violations:
             violations = self.condensed.violations(sample, moves)
-        for array in (changes, kept, violations):
-            if array is not None:
-                array.setflags(write=False)
         return Plan(
             moves, status, plan.iterations, lower_bound, plan.guess, kept, objective, plan.remarks, plan.active,
             plan.memory, violations,
@@ -327,8 +324,6 @@ class Controller(ABC):
         violations = self._unknown_violations
         if sample is not None:
             violations = self.condensed.violations(sample, moves)
-        for array in (moves, planned, violations):
-            array.setflags(write=False)
         return plan._replace(
             moves=moves, lower_bound=-np.inf, inputs=planned, objective=np.nan,
             remarks=remarks, violations=violations,
@@ -346,6 +341,8 @@ class Controller(ABC):
         if violations is None:
             violations = self._no_violations
         # What is handed out is also what is remembered.
+        for array in (planned, changes, violations):
+            array.setflags(write=False)
         u, history = inputs.applied(planned), state.inputs
         if len(history) == 1:
             history = u[None]
