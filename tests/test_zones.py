@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 import mampc
 from builders import cost_of, distance, predicted, random_model
 from mampc import Status
+from mampc.base.words import Remark
 from mampc.methods import local_search
 from mampc.methods.exact import sample_problem, search, zone_search
 from mampc.methods.exact.relaxation import Relaxation
@@ -366,3 +367,27 @@ def test_outputs_that_run_far_away_from_their_zones_leave_the_optimum_what_it_is
     )
     assert decision.status is Status.OPTIMAL
     assert decision.objective == pytest.approx(best, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plant_that_runs_away_from_its_zone_is_proven_no_further_than_rounding_lets_it(seed):
+    rng = np.random.default_rng(seed)
+    model = mampc.StateSpace([[1.2, 0], [0, 0.6]], rng.uniform(-1, 1, (2, 2)), [[1.0, 1.0]], None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=105, control_horizon=3, move_weight=1.0, limits=mampc.Limits(du_max=9.0),
+        zone_below=0.1, zone_above=0.1,
+    )  # fmt: skip
+    with pytest.warns(mampc.MampcWarning, match="grow"):
+        controller = mampc.MAMPC(problem, mampc.MoveRules(max_moves=2 + seed % 2))
+    x = np.zeros(2)
+    decision = controller.step(controller.initial_state(), x, np.ones(1))
+    state, cost = x.astype(np.longdouble), np.sum(np.square(decision.changes.astype(np.longdouble)))
+    for i in range(106):
+        y = (model.C.astype(np.longdouble) @ state)[0]
+        cost += np.maximum(abs(y - 1) - np.longdouble(0.1), 0) ** 2
+        state = model.A.astype(np.longdouble) @ state + model.B @ decision.plan[min(i, 2)].astype(
+            np.longdouble
+        )
+    assert decision.lower_bound <= cost
+    assert abs(decision.objective - cost) <= max(decision.gap * cost, 1e-9 * cost)
+    assert Remark.ROUNDING in decision.remarks

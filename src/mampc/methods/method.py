@@ -49,7 +49,7 @@ def doubted(plan: Plan, condensed: CondensedQP, sample: Sample) -> Plan:
     bound = objective if plan.lower_bound is None else plan.lower_bound
     if objective is None or bound is None or bound == -np.inf:
         return plan
-    doubt = left_open(objective, condensed.rounding(sample))
+    doubt = left_open(objective, condensed.rounding(sample, plan.moves))
     if doubt <= CERTAIN * objective:
         return plan
     status = Status.FEASIBLE if plan.status is Status.OPTIMAL else plan.status

@@ -244,10 +244,16 @@ class CondensedQP:
                 cost += errors.dot(errors)
         return float(cost)
 
-    def rounding(self, sample: Sample) -> float:
-        """How far rounding may shift the vector whose squared length is the cost of a plan, in roots of cost."""
+    def rounding(self, sample: Sample, moves: Array | None = None) -> float:
+        """How far rounding may shift the vector whose squared length is the cost of a plan, in roots of cost.
+
+        What moves, shape (n_moves,), add to errors beside zones counts where they are given.
+        """
         added = self._error_lengths[len(sample.parameter)].dot(np.abs(sample.parameter))
-        return ROUNDING * float(added + self.lengths.dot(np.abs(sample.moves)))
+        added += self.lengths.dot(np.abs(sample.moves))
+        if moves is not None and self.bounds.zones is not None:
+            added += self.bounds.zones.lengths.dot(np.abs(moves))
+        return ROUNDING * float(added)
 
     def violations(self, sample: Sample, moves: Array, *, faded: bool = False) -> Array:
         """Largest predicted excess over its limits of each output over i = 1..np, shape (l,).

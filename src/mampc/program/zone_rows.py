@@ -29,6 +29,7 @@ class ZoneRows:
         theta: g per move, shape (k, n_moves).
         low, high: ends less g without moves, as maps of p, shape (k, its size).
         root: sqrt(q) of each, shape (k,).
+        lengths: of g times that per move, shape (n_moves,).
         weighted_free: g without moves times that, as a map of p.
     """
 
@@ -59,6 +60,7 @@ class ZoneRows:
             low, high = np.vstack([low, aims[0]]), np.vstack([high, aims[1]])
             weight = np.concatenate([(1 - pull) * weight, pull * weight])
         self.theta, self.root = theta, np.sqrt(weight)
+        self.lengths = np.linalg.norm(self.root[:, None] * theta, axis=0)
         self.low, self.high = low - free, high - free
         self.weighted_free = self.root[:, None] * free
 
