@@ -33,6 +33,7 @@ from mampc.identification.subspace import (
 )
 
 NEAR_BEST = 1.02  # simulation errors that are as good as equal
+VERY_STRONG = 10.0  # difference of Schwarz's criterion (Kass and Raftery, J. Amer. Stat. Assoc. 90 (1995))
 ROUNDING = 1e-6  # of the spread: smaller errors are as good as none
 LITTLE = 0.2  # a filter's pole that makes no difference
 EQUATIONS, LEAST = 15_000, 1000  # in which orders are compared, and samples
@@ -147,7 +148,8 @@ def _likeliest(
 ) -> int:
     """The order of the least Schwarz criterion, or a larger one: the smallest whose errors are within 2 % of the best.
 
-    Where residuals are `white` the criterion counts them rightly, and decides alone.
+    Where residuals are `white` the criterion counts them rightly, and decides alone: the smallest order that none
+    beats by very strong evidence.
 
     Every order up to six is tried, every second or third beyond, and those beside the one that these point to.
     Residuals count as so many samples as they amount to, given how the fullest model's are correlated.
@@ -170,9 +172,11 @@ def _likeliest(
     information = cache(lambda n: float(samples @ variance(n) + price * n))
     at = coarse.index(min(coarse, key=information))
     lower, upper = coarse[max(at - 1, 0)], coarse[min(at + 1, len(coarse) - 1)]
-    likeliest = min((n for n in orders if lower <= n <= upper), key=information)
+    near = [n for n in orders if lower <= n <= upper]
+    likeliest = min(near, key=information)
     if white:
-        return likeliest
+        least = information(likeliest) + VERY_STRONG
+        return next(n for n in orders if (n in coarse or n in near) and information(n) <= least)
     best = min(variance(n).sum() for n in coarse)
     alike = next(n for n in coarse if variance(n).sum() <= best + 2 * outputs * np.log(NEAR_BEST))
     return max(likeliest, alike)
