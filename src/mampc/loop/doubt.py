@@ -23,11 +23,9 @@ def moves_of_late(model: StateSpace) -> Array:
     dead time d of this input and output is over: what comes later than expected shows no sooner.
     Integrators in a row, which nothing else holds, go far while plans wait: their moves cast no doubt.
     """
-    n, m, l = model.n_states, model.n_inputs, model.n_outputs
+    m, l = model.n_inputs, model.n_outputs
     faded = int(np.ceil(-LATE * np.log(FADED)))
-    done = model.step_response(n + faded + 2)[1:, :, :m]
-    answers = np.abs(done) > NEGLIGIBLE * np.abs(done[: n + 1]).max(axis=0)
-    dead = answers[: n + 1].argmax(axis=0)  # what does nothing for n samples never does, but for rounding
+    done, dead = model.step_response(model.n_states + faded + 2)[1:, :, :m], dead_times(model)
     if runs_away(model) and np.abs(model.poles()).max() <= 1 + INTEGRATES:
         done[:] = dead[:] = 0
     count = int(dead.max(initial=0)) + faded
@@ -37,6 +35,16 @@ def moves_of_late(model: StateSpace) -> Array:
     _, moves, before, u = np.split(np.eye(l + (count + 2) * m), np.cumsum([l, count * m, m]))
     moves = np.vstack([u - before, moves[: (count - 1) * m]])
     return np.vstack([counts.transpose(1, 0, 2).reshape(l, -1) @ moves, moves, u])
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def dead_times(model: StateSpace) -> Array:
+    """Samples after which each output begins to answer each input, less one, shape (l, m); 0 where it never does."""
+    n = model.n_states
+    done = np.abs(model.step_response(n + 2)[1:, :, : model.n_inputs])
+    answers = done > NEGLIGIBLE * done.max(axis=0)
+    dead: Array = answers.argmax(axis=0)  # what does nothing for n samples never does, but for rounding
+    return dead
 
 
 def remembers(model: StateSpace) -> bool:

@@ -43,12 +43,16 @@ class KalmanFilter(Estimator):
         directions: how the disturbances act.
         covariance: of the predicted state and disturbances, stationary, in that order.
         noise: covariance of the measurement noise, shape (l, l).
+
+    Attributes:
+        A, C: of the model with the disturbances as further states.
+        gain: from innovation to these, with every output believed.
     """
 
     def __init__(self, model: StateSpace, directions: Directions, covariance: Array, noise: Array) -> None:
         self.model, self.directions = model, directions
         self._covariance, self._noise = covariance, noise
-        self._A, self._C = _augmented(model, directions)
+        self.A, self.C = _augmented(model, directions)
         self._gains: dict[bytes, Array] = {}
         self.gain = self.gain_with(np.ones(model.n_outputs, dtype=bool))
         self.map, self._parts = self._everyday()
@@ -139,12 +143,12 @@ class KalmanFilter(Estimator):
         key = believed.tobytes()
         gain = self._gains.get(key)
         if gain is None:
-            C, P = self._C[believed], self._covariance
+            C, P = self.C[believed], self._covariance
             gain = np.zeros((len(P), len(believed)))
             gain[:, believed] = np.linalg.solve(
                 C @ P @ C.T + self._noise[np.ix_(believed, believed)], C @ P
             ).T
-            error = self._A - gain @ self._C @ self._A
+            error = self.A - gain @ self.C @ self.A
             allowed = max(1.0, float(np.max(np.abs(np.linalg.eigvals(self.model.A)), initial=0.0)))
             if not np.max(np.abs(np.linalg.eigvals(error))) <= allowed + 1e-9:
                 gain = np.zeros_like(gain)
@@ -162,7 +166,7 @@ class KalmanFilter(Estimator):
         if y is None:
             return replace(none, x=model.steady_state(np.concatenate([u, model.v_op if v is None else v])))
         # x = A x + B change + (disturbances), y = y_op + C x + D change + (disturbances)
-        A, C, noise = self._A, self._C, np.sqrt(np.diag(self._noise))
+        A, C, noise = self.A, self.C, np.sqrt(np.diag(self._noise))
         at_rest = np.vstack([np.eye(n, len(A)) - A[:n], C / noise[:, None]])
         explained = as_vector("y", y, l) - model.y_op - model.D @ change
         rest = np.linalg.lstsq(at_rest, np.concatenate([model.B @ change, explained / noise]))[0]

@@ -14,7 +14,8 @@ last samples did to the outputs, dead times aside, h, their innovations may be o
 diag(S_b^-1) h / l times as much, and what is corrected falls by as much (but where modes integrate or grow, and errors
 would not fade). Meanwhile plans count on the bank with the weight t = sum_b mu_b t_b, and for the rest on the plain
 filter that a regulator would have without a bank: that one follows slowly, and in one way whatever happens, so that a
-wrong model costs little more with a bank than without. The factor of the noise counts up to one here: errors of the
+wrong model costs little more with a bank than without. Where the model resonates, plans count on the bank by what of it
+came true besides (`hindsight`). The factor of the noise counts up to one here: errors of the
 model, which make it larger, are no reason for less caution. Where the noise was guessed it counts as the least it can
 be, since moves may be far above the noise and within its guess.
 
@@ -24,6 +25,7 @@ stationary gains, and with jumps that give way to what held before them.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,6 +36,7 @@ from mampc.base.words import LoadKind
 from mampc.loop.doubt import moves_of_late, remembers
 from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.guessed_noise import guessed_noise
+from mampc.loop.hindsight import Hindsight, compared
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
 from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.mixing import NOISE_RANGE, BankEstimate, Filters, Mixing, filters_of
@@ -112,6 +115,7 @@ class LoadBank(Estimator):
         self._everything = self.filters(self._all)
         self._of_late, self._moved = moves_of_late(model), slice(l)
         self._remembers = remembers(model)
+        self._hindsight = Hindsight(self._planning_model, self.plain, sizes)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         # The members' models differ in how s goes on: all may have the same A once their mixed z are multiplied by
         # `_begins` before, and by `_goes_on` after.
@@ -120,6 +124,9 @@ class LoadBank(Estimator):
         self._begins = np.hstack([lasting, np.repeat(kept > 0, self.loads.count, axis=1)])
         self._goes_on = np.hstack([lasting, np.repeat(kept, self.loads.count, axis=1)])
         self._of_mixed, self._of_known = self._everyday()
+        sizes_of_known = len(self._of_mixed) + 2 * l, len(self._of_late), len(self._plain_part)
+        ends = [0, *np.cumsum(sizes_of_known).tolist(), len(self._of_known)]
+        self._parts_of_known, self._nothing = [slice(*pair) for pair in pairwise(ends)], np.zeros(l)
 
     @classmethod
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
@@ -160,9 +167,19 @@ class LoadBank(Estimator):
         return np.tile(np.stack(shifts)[:, None], (1, samples, 1, 1))
 
     def weights_of(self, estimate: Estimate) -> Array:
-        """How likely each hypothesis is, times the variance of the noise beside what was told."""
+        """How likely each hypothesis is, times the variance of the noise beside what was told.
+
+        For models that resonate also times the square of how much plans count on the bank, since what data will tell
+        goes with it.
+        """
         bank = _bank(estimate)
-        return bank.weights * bank.scale[..., :1]
+        if not self._hindsight.counts:
+            return bank.weights * bank.scale[..., :1]
+        moved = np.square(bank.late[..., self._moved]) @ self._everything.precisions.T
+        doubt = moved / np.minimum(bank.scale[..., :1], 1.0)
+        counts = (bank.weights / (1 + doubt)).sum(axis=-1) * self._hindsight.share(bank.sums, bank.scale)
+        weights: Array = bank.weights * bank.scale[..., :1] * np.square(counts)[..., None]
+        return weights
 
     def load(self, estimate: Estimate) -> LoadKind:
         """The hypothesis that is the most likely one, in words."""
@@ -183,7 +200,10 @@ class LoadBank(Estimator):
         members[:, n + k :] = 0.0
         plain = _flat(self.plain.with_loads(self._plain_of(bank), stuck, loads[:, k:]))
         counts = self._counts(bank.weights, bank.late, bank.scale)
-        return self._estimate(members, bank.weights, bank.usual, bank.scale, bank.late, plain, counts)
+        hindsight = bank.missed, bank.foretold.copy(), bank.sums
+        return self._estimate(
+            members, bank.weights, bank.usual, bank.scale, bank.late, plain, counts, hindsight
+        )
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
         """In a steady state under inputs u (m,) and measured disturbances v (d,), default those of the operating
@@ -198,33 +218,44 @@ class LoadBank(Estimator):
         scale = np.array([1.0, self._told])
         plain = _flat(self.plain.initial(u, y, v))
         chances = usual @ self._mixing.chances
-        return self._estimate(members, chances, usual, scale, late, plain, 1.0)
+        h, l = self._hindsight.horizon, model.n_outputs
+        hindsight = np.zeros(h * l), np.zeros((h + 1) * l), np.zeros(2)
+        return self._estimate(members, chances, usual, scale, late, plain, 1.0, hindsight)
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
         bank, l, n_z = _bank(last), len(y), len(self._of_mixed)
-        known = np.concatenate((bank.members.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain))
+        known = np.concatenate(
+            (bank.members.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain, bank.missed)
+        )
         if not is_usable(known):
             return None
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
         mixed *= self._begins
         told, each = self._of_known.dot(known[mixed.size :]), mixed.dot(self._of_mixed)
         each += told[: n_z + 2 * l]
+        _, late, plain, missed = (told[part] for part in self._parts_of_known)
+        foretold = np.concatenate((self._nothing, bank.foretold[:-l]))
+        sums = compared(bank.sums, foretold[-l:], missed[:l])
         seen = c.dot(each[:, n_z:])  # innovation and movement of the mixture
         estimate = self._weighed(
             each[:, :n_z] * self._goes_on, each[:, n_z : n_z + l].ravel(),
-            told[n_z + 2 * l : -len(bank.plain)], told[-len(bank.plain) :], c, bank, self._everything,
+            late, plain, c, bank, self._everything, (missed, foretold, sums),
         )  # fmt: skip
         return Updated(estimate, seen[:l], seen[l:])
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
         """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
         bank, l, n_z, filters = _bank(last), y.shape[1], len(self._of_mixed), self._everything
-        known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1)), bank.late, bank.plain), axis=1)
+        known = np.concatenate(
+            (u, v_last, v, y, np.ones((len(y), 1)), bank.late, bank.plain, bank.missed), axis=1
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
             told = known @ self._of_known.T
-            each, late, plain = np.split(told, [n_z + 2 * l, -len(bank.plain.T)], axis=1)
+            each, late, plain, missed = (told[:, part] for part in self._parts_of_known)
+            foretold = np.concatenate((np.zeros_like(y), bank.foretold[:, :-l]), axis=1)
+            hindsight = missed, foretold, compared(bank.sums, foretold[:, -l:], missed[:, :l])
             each = (mixed * self._begins) @ self._of_mixed + each[:, None]
             seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:])
             innovations = each[:, :, n_z : n_z + l].reshape(len(y), -1)
@@ -236,19 +267,20 @@ class LoadBank(Estimator):
             correction = (innovations @ filters.gains.T).reshape(mixed.shape)
             members = each[:, :, :n_z] * self._goes_on + self._damped(trust)[..., None] * correction
             counts = (weights * trust).sum(axis=1, keepdims=True)
-            estimate = self._estimate(members, weights, usual, scale, late, plain, counts)
+            estimate = self._estimate(members, weights, usual, scale, late, plain, counts, hindsight)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
     def _everyday(self) -> tuple[Array, Array]:
-        """What `update` needs of a mixed z and of all else that is known, (u, v_last, v, y, 1, late, plain).
+        """What `update` needs of a mixed z and of all else that is known, (u, v_last, v, y, 1, late, plain,
+        missed).
 
         The map from z, transposed, is the same for all hypotheses: to z predicted, innovation and movement of the
-        outputs. That of the known has the same rows, and below them the next `late` and `plain`.
+        outputs. That of the known has the same rows, and below them the next `late`, `plain` and `missed`.
         """
         model, k = self.model, self.loads.count
         n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
-        sizes = (m, d, d, l, 1, len(self._of_late), n + l + m)
-        u, v_last, v, y, one, late, plain = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
+        sizes = (m, d, d, l, 1, len(self._of_late), n + l + m, len(self._hindsight.misses))
+        u, v_last, v, y, one, late, plain, missed = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
         op = np.outer(model.all_inputs_op, one)
         drive = model.B @ (np.vstack([u, v_last]) - op)
         surplus = y - np.outer(model.y_op, one) - model.D @ (np.vstack([u, v]) - op)
@@ -256,9 +288,12 @@ class LoadBank(Estimator):
         A[n : n + k, n + k :] = A[n + k :, n + k :] = np.eye(k)
         of_z = np.vstack([A, -C @ A, model.C @ (A[:n] - np.eye(n, len(A)))])
         driven = np.vstack([drive, np.zeros((2 * k, drive.shape[1]))])
-        of_plain = self.plain.map[: n + l + m] @ np.vstack([plain, u, v_last, v, y, one])
+        of_plain, innovation = np.split(
+            self.plain.map[: n + l + m + l] @ np.vstack([plain, u, v_last, v, y, one]), [n + l + m]
+        )
+        of_missed = self._hindsight.misses @ np.vstack([missed, innovation / self.noise[:, None]])
         of_late = self._of_late @ np.vstack([late, u])
-        of_known = np.vstack([driven, surplus - C @ driven, model.C @ drive, of_late, of_plain])
+        of_known = np.vstack([driven, surplus - C @ driven, model.C @ drive, of_late, of_plain, of_missed])
         return np.ascontiguousarray(of_z.T), of_known
 
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
@@ -269,8 +304,10 @@ class LoadBank(Estimator):
         members[:, : model.n_states] += model.B @ self._change(u, v)
         late = self._of_late.dot(np.concatenate((bank.late, u)))
         plain = _flat(self.plain.predict(self._plain_of(bank), u, v))
-        counts = self._counts(c, late, bank.scale)
-        return self._estimate(members, c, bank.usual, bank.scale, late, plain, counts)
+        counts, l = self._counts(c, late, bank.scale), model.n_outputs
+        missed = self._hindsight.misses.dot(np.concatenate((bank.missed, self._nothing)))
+        hindsight = missed, np.concatenate((self._nothing, bank.foretold[:-l])), bank.sums
+        return self._estimate(members, c, bank.usual, bank.scale, late, plain, counts, hindsight)
 
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
         """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
@@ -291,7 +328,14 @@ class LoadBank(Estimator):
         seen_beside = bank.weights @ seen + self.plain.innovation(plain, model.u_op, model.y_op)
         off = np.where(believed, innovation + seen_beside, 0.0)
         corrected = _flat(self.plain.corrected(plain, off, believed))
-        return self._weighed(bank.members, each.ravel(), bank.late, corrected, bank.weights, bank, filters)
+        missed, l = bank.missed.copy(), len(off)
+        missed[:l] += off / self.noise
+        missed[l : 2 * l] = off / self.noise
+        sums = compared(bank.sums, bank.foretold[-l:] * believed, missed[:l])
+        hindsight = missed, bank.foretold.copy(), sums
+        return self._weighed(
+            bank.members, each.ravel(), bank.late, corrected, bank.weights, bank, filters, hindsight
+        )
 
     def filters(self, believed: BoolArray) -> Filters:
         """The gains where only some outputs, bool (l,), are believed."""
@@ -310,6 +354,7 @@ class LoadBank(Estimator):
         c: Array,
         bank: BankEstimate,
         filters: Filters,
+        hindsight: tuple[Array, Array, Array],
     ) -> BankEstimate:
         """The estimate after Bayes' rule.
 
@@ -318,6 +363,7 @@ class LoadBank(Estimator):
             innovations: of one hypothesis after the other, shape (B l,).
             late, plain: of the estimate, predicted, and the latter corrected.
             c: how likely each hypothesis was before, shape (B,).
+            hindsight: of the estimate, as `_estimate` takes it.
         """
         surprise = self._of_each.dot(np.square(filters.whiten.dot(innovations)))
         moved = filters.precisions.dot(np.square(late[self._moved]))
@@ -325,7 +371,7 @@ class LoadBank(Estimator):
         correction = filters.gains.dot(innovations).reshape(members.shape)
         correction *= self._damped(trust)[:, None]
         correction += members
-        return self._estimate(correction, weights, usual, scale, late, plain, weights.dot(trust))
+        return self._estimate(correction, weights, usual, scale, late, plain, weights.dot(trust), hindsight)
 
     def _damped(self, trust: Array) -> Array:
         """By what hypotheses correct less: not at all where a mode integrates or grows, and errors stay."""
@@ -345,11 +391,21 @@ class LoadBank(Estimator):
         late: Array,
         plain: Array,
         counts: Any,
+        hindsight: tuple[Array, Array, Array],
     ) -> BankEstimate:
-        """The estimate whose plans count on the bank with the weight t, `counts`, and else on the plain filter."""
+        """The estimate whose plans count on the bank with the weight t, `counts`, times its share in hindsight, and
+        else on the plain filter.
+
+        Args:
+            hindsight: `missed`, `foretold` and `sums`; what is foretold now is written to the second.
+        """
+        missed, foretold, sums = hindsight
         each = (weights[..., None] * members).reshape((*weights.shape[:-1], -1))
         plan = plain.dot(self._plain_part)
-        plan += counts * (each.dot(self._mixture) - plan)
+        beside = each.dot(self._mixture) - plan
+        foretold[..., : self.model.n_outputs] = beside.dot(self._hindsight.foretells.T)
+        share = self._hindsight.share(sums, scale)
+        plan += counts * share[..., None] * beside
         x, at_inputs, at_outputs = self._parts
         return BankEstimate(
             plan[..., x],
@@ -361,6 +417,9 @@ class LoadBank(Estimator):
             scale,
             late,
             plain,
+            missed,
+            foretold,
+            sums,
         )
 
     def _plain_of(self, bank: BankEstimate) -> Estimate:

@@ -42,6 +42,7 @@ class BankEstimate(Estimate):
         late: what the inputs' moves of the last samples did to the outputs (l,), these moves (N, m) with the latest
             first, and the inputs (m,), one behind the other.
         plain: x, d_y and d_u of the plain filter, shape (n + l + m,).
+        missed, foretold, sums: what `Hindsight` compares, shapes (h l,), ((h + 1) l,) and (2,); the latest is first.
     """
 
     members: Array
@@ -50,6 +51,9 @@ class BankEstimate(Estimate):
     scale: Array
     late: Array
     plain: Array
+    missed: Array
+    foretold: Array
+    sums: Array
 
 
 class Filters(NamedTuple):

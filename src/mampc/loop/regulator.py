@@ -194,6 +194,9 @@ class Regulator:
         scale = getattr(state.estimate, "scale", np.ones(1))
         if not (scale > 0).all():
             raise MampcError(f"state: expected positive numbers at estimate.scale, received {scale}")
+        squares = getattr(state.estimate, "sums", np.zeros(2))[1]
+        if squares < 0:
+            raise MampcError(f"state: expected a sum of squares at estimate.sums, received {squares}")
         if not active_flags(state.controller.active):
             raise MampcError(
                 f"state: expected flags at controller.active, received {state.controller.active}"
