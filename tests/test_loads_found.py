@@ -199,7 +199,7 @@ def test_an_identified_model_knows_its_noise():
     [
         ({"noise": None}, "expected the standard deviation"),
         ({"noise": [0.1]}, "expected"),
-        ({"noise": 0.0}, "positive"),
+        ({"noise": 0.0}, "above 0"),
         ({"noise": 0.1, "hypotheses": ()}, "at least one"),
         ({"noise": 0.1, "hypotheses": ("steady",)}, "Hypothesis"),
         ({"noise": 0.1, "model": "tank"}, "StateSpace"),
