@@ -18,6 +18,11 @@ FEW_MOVES = 10  # of an input; fewer say little about anything but the largest o
 TOGETHER = 0.9  # correlation of moves from which two inputs cannot be told apart
 SHORT = 5.0  # settling times: a shorter record has hardly one step of each kind
 LONG_ENOUGH = 12  # settling times
+ANSWERS, LAGS, MOST = (
+    0.99,
+    10,
+    20_000,
+)  # share of an input that outputs explain; samples of their past, and of all
 
 
 def missing_movement(names: Sequence[str], pieces: Sequence[Array]) -> list[str]:
@@ -56,10 +61,39 @@ def movement_of(records: Sequence[IOData]) -> list[str]:
     return missing_movement(records[0].names.inputs, [record.u for record in records])
 
 
+def answering(records: Sequence[IOData]) -> list[str]:
+    """Which inputs do nothing but answer outputs, a sentence each: moved by a controller, with no test of their own.
+
+    What the past of the inputs leaves of an input is explained by present and past outputs. Inputs that mostly stand
+    still do not count: outputs may show them within a sample.
+    """
+    longest = max(records, key=len)[:MOST]
+    u, y, N = longest.u, longest.y, len(longest) - LAGS
+    m, l = u.shape[1], y.shape[1]
+    if 10 * (LAGS + 1) * (m + l) > N:
+        return []
+    own = np.linalg.qr(
+        np.hstack([np.ones((N, 1)), *(u[LAGS - i : LAGS - i + N] for i in range(1, LAGS + 1))])
+    )[0]
+    seen = np.hstack([y[LAGS - i : LAGS - i + N] for i in range(LAGS + 1)])
+    spread = seen.std(axis=0)
+    seen = (seen - seen.mean(axis=0))[:, spread > 0] / spread[spread > 0]
+    new, seen = u[LAGS:] - own @ (own.T @ u[LAGS:]), seen - own @ (own.T @ seen)
+    left = new - seen @ np.linalg.lstsq(seen, new, rcond=1e-10)[0]
+    moved = np.mean(np.diff(u, axis=0) != 0, axis=0) > 0.5
+    answers = moved & (np.sum(left**2, axis=0) < (1 - ANSWERS) * np.sum(new**2, axis=0))
+    return [
+        f"{name} follows from the outputs but for 1 %: a controller moved it, and the model may say more of that and "
+        "of loads than of the plant, whatever its fit and deviations; record a test, or changes of its set point"
+        for name, follows in zip(longest.names.inputs, answers, strict=False)
+        if follows
+    ]
+
+
 def left_open(model: StateSpace, records: Sequence[IOData]) -> list[str]:
     """What records cannot say of a model that was identified from them, a sentence each with what to record next."""
     found = properties(model)
-    said = movement_of(records)
+    said = movement_of(records) + answering(records)
     doubtful = doubtful_gains(model, found)
     if doubtful:
         said.append(
