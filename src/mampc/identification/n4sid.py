@@ -26,7 +26,8 @@ from mampc.systems.state_space import StateSpace
 
 DETREND = ("auto", *DEGREES)
 UNSTABLE = (
-    "The record was taken under feedback and shows poles outside the unit circle for certain; they were kept."
+    "The record was taken under feedback and shows poles outside the unit circle for certain; they were kept. A load "
+    "that moves in a large wave can look so too: unless the plant runs away on its own, do not use this model."
 )
 LEAST_NOISE = 1e-6  # of an output's spread: a record without noise shows rounding
 
