@@ -235,8 +235,10 @@ class LoadBank(Estimator):
         told, each = self._of_known.dot(known[mixed.size :]), mixed.dot(self._of_mixed)
         each += told[: n_z + 2 * l]
         _, late, plain, missed = (told[part] for part in self._parts_of_known)
-        foretold = np.concatenate((self._nothing, bank.foretold[:-l]))
-        sums = compared(bank.sums, foretold[-l:], missed[:l])
+        foretold, sums = bank.foretold, bank.sums
+        if self._hindsight.counts:
+            foretold = np.concatenate((self._nothing, foretold[:-l]))
+            sums = compared(sums, foretold[-l:], missed[:l])
         seen = c.dot(each[:, n_z:])  # innovation and movement of the mixture
         estimate = self._weighed(
             each[:, :n_z] * self._goes_on, each[:, n_z : n_z + l].ravel(),
@@ -403,9 +405,10 @@ class LoadBank(Estimator):
         each = (weights[..., None] * members).reshape((*weights.shape[:-1], -1))
         plan = plain.dot(self._plain_part)
         beside = each.dot(self._mixture) - plan
-        foretold[..., : self.model.n_outputs] = beside.dot(self._hindsight.foretells.T)
-        share = self._hindsight.share(sums, scale)
-        plan += counts * share[..., None] * beside
+        if self._hindsight.counts:
+            foretold[..., : self.model.n_outputs] = beside.dot(self._hindsight.foretells.T)
+            counts = counts * self._hindsight.share(sums, scale)[..., None]
+        plan += counts * beside
         x, at_inputs, at_outputs = self._parts
         return BankEstimate(
             plan[..., x],
