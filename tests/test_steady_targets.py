@@ -8,7 +8,7 @@ import pytest
 
 import mampc
 from builders import tank_model, tank_problem
-from test_rivals import UNIT, double_integrator
+from test_open_loop import UNIT, double_integrator
 
 
 @pytest.mark.parametrize(("pole", "sample"), [(0.8, -1), (1.25, 0)])
