@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from mampc.base.checks import Array, BoolArray, is_usable
 from mampc.base.words import LoadKind
 from mampc.systems.state_space import StateSpace
@@ -23,6 +25,11 @@ class Estimate:
     def is_usable(self) -> bool:
         """Whether all numbers are."""
         return all(is_usable(part.ravel()) for part in vars(self).values())
+
+    @property
+    def flat(self) -> Array:
+        """x, d_y and d_u in a row, shape (n + l + m,)."""
+        return np.concatenate((self.x, self.output_disturbance, self.input_disturbance))
 
 
 class Updated(NamedTuple):

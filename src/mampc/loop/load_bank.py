@@ -25,7 +25,6 @@ stationary gains, and with jumps that give way to what held before them.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -35,11 +34,12 @@ from mampc.base.errors import MampcError
 from mampc.base.words import LoadKind
 from mampc.loop.doubt import moves_of_late, remembers
 from mampc.loop.estimator import Estimate, Estimator, Updated
+from mampc.loop.everyday import everyday
 from mampc.loop.guessed_noise import guessed_noise
 from mampc.loop.hindsight import Hindsight, compared
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
 from mampc.loop.kalman_filter import KalmanFilter
-from mampc.loop.mixing import NOISE_RANGE, BankEstimate, Filters, Mixing, filters_of
+from mampc.loop.mixing import NOISE_RANGE, BankEstimate, Filters, Mixing, bank_estimate, filters_of
 from mampc.program.problem import TrackingProblem
 from mampc.systems.noise import white_noise
 from mampc.systems.state_space import StateSpace, as_discrete
@@ -114,7 +114,9 @@ class LoadBank(Estimator):
         self._all = np.ones(model.n_outputs, dtype=bool)
         self._everything = self.filters(self._all)
         self._of_late, self._moved = moves_of_late(model), slice(l)
-        self._remembers = remembers(model)
+        self._damps = not remembers(
+            model
+        )  # where a mode integrates or grows errors stay, and are corrected in full
         self._hindsight = Hindsight(self._planning_model, self.plain, sizes)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         # The members' models differ in how s goes on: all may have the same A once their mixed z are multiplied by
@@ -123,10 +125,8 @@ class LoadBank(Estimator):
         lasting = np.ones((len(kept), model.n_states + self.loads.count))
         self._begins = np.hstack([lasting, np.repeat(kept > 0, self.loads.count, axis=1)])
         self._goes_on = np.hstack([lasting, np.repeat(kept, self.loads.count, axis=1)])
-        self._of_mixed, self._of_known = self._everyday()
-        sizes_of_known = len(self._of_mixed) + 2 * l, len(self._of_late), len(self._plain_part)
-        ends = [0, *np.cumsum(sizes_of_known).tolist(), len(self._of_known)]
-        self._parts_of_known, self._nothing = [slice(*pair) for pair in pairwise(ends)], np.zeros(l)
+        self._everyday = everyday(self.loads, self.members[0], self._of_late, self.plain, self._hindsight)
+        self._nothing = np.zeros(l)
 
     @classmethod
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
@@ -172,7 +172,7 @@ class LoadBank(Estimator):
         For models that resonate also times the square of how much plans count on the bank, since what data will tell
         goes with it.
         """
-        bank = _bank(estimate)
+        bank = bank_estimate(estimate)
         if not self._hindsight.counts:
             return bank.weights * bank.scale[..., :1]
         moved = np.square(bank.late[..., self._moved]) @ self._everything.precisions.T
@@ -183,22 +183,22 @@ class LoadBank(Estimator):
 
     def load(self, estimate: Estimate) -> LoadKind:
         """The hypothesis that is the most likely one, in words."""
-        return self.hypotheses[int(_bank(estimate).weights.argmax())].load
+        return self.hypotheses[int(bank_estimate(estimate).weights.argmax())].load
 
     def loads_of(self, estimate: Estimate) -> Array:
         """Loads of the mixture (k,), in sizes that show in the outputs like their noise, and of the plain filter."""
-        bank, members = _bank(estimate), _bank(estimate).members[..., self._of_loads]
+        bank, members = bank_estimate(estimate), bank_estimate(estimate).members[..., self._of_loads]
         one = bank.weights.ndim == 1
         loads: Array = bank.weights.dot(members) if one else np.einsum("sb,sbz->sz", bank.weights, members)
         return np.concatenate((loads, bank.plain[..., self.model.n_states :]), axis=-1)
 
     def with_loads(self, estimate: Estimate, stuck: BoolArray, loads: Array) -> Estimate:
         """The estimate with the loads of before the outputs `stuck` (l,) were; see `Estimator`."""
-        bank, n, k = _bank(estimate), self.model.n_states, self.loads.count
+        bank, n, k = bank_estimate(estimate), self.model.n_states, self.loads.count
         members = bank.members.copy()
         members[:, n : n + k] = loads[int(stuck.argmax()), :k]
         members[:, n + k :] = 0.0
-        plain = _flat(self.plain.with_loads(self._plain_of(bank), stuck, loads[:, k:]))
+        plain = self.plain.with_loads(self._plain_of(bank), stuck, loads[:, k:]).flat
         counts = self._counts(bank.weights, bank.late, bank.scale)
         hindsight = bank.missed, bank.foretold.copy(), bank.sums
         return self._estimate(
@@ -216,7 +216,7 @@ class LoadBank(Estimator):
         members = np.tile(np.concatenate([x, w, np.zeros(k)]), (len(usual), 1))
         late = np.concatenate([np.zeros(len(self._of_late) - len(u)), u])
         scale = np.array([1.0, self._told])
-        plain = _flat(self.plain.initial(u, y, v))
+        plain = self.plain.initial(u, y, v).flat
         chances = usual @ self._mixing.chances
         h, l = self._hindsight.horizon, model.n_outputs
         hindsight = np.zeros(h * l), np.zeros((h + 1) * l), np.zeros(2)
@@ -224,7 +224,7 @@ class LoadBank(Estimator):
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
-        bank, l, n_z = _bank(last), len(y), len(self._of_mixed)
+        bank, l, n_z = bank_estimate(last), len(y), len(self._everyday.of_mixed)
         known = np.concatenate(
             (bank.members.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain, bank.missed)
         )
@@ -232,9 +232,9 @@ class LoadBank(Estimator):
             return None
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
         mixed *= self._begins
-        told, each = self._of_known.dot(known[mixed.size :]), mixed.dot(self._of_mixed)
+        told, each = self._everyday.of_known.dot(known[mixed.size :]), mixed.dot(self._everyday.of_mixed)
         each += told[: n_z + 2 * l]
-        _, late, plain, missed = (told[part] for part in self._parts_of_known)
+        _, late, plain, missed = (told[part] for part in self._everyday.parts)
         foretold, sums = bank.foretold, bank.sums
         if self._hindsight.counts:
             foretold = np.concatenate((self._nothing, foretold[:-l]))
@@ -248,17 +248,22 @@ class LoadBank(Estimator):
 
     def updates(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated:
         """`update` for many loops, whose arrays have these first; what is not usable comes out as it may."""
-        bank, l, n_z, filters = _bank(last), y.shape[1], len(self._of_mixed), self._everything
+        bank, l, n_z, filters = (
+            bank_estimate(last),
+            y.shape[1],
+            len(self._everyday.of_mixed),
+            self._everything,
+        )
         known = np.concatenate(
             (u, v_last, v, y, np.ones((len(y), 1)), bank.late, bank.plain, bank.missed), axis=1
         )
         with np.errstate(over="ignore", invalid="ignore"):
             c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
-            told = known @ self._of_known.T
-            each, late, plain, missed = (told[:, part] for part in self._parts_of_known)
+            told = known @ self._everyday.of_known.T
+            each, late, plain, missed = (told[:, part] for part in self._everyday.parts)
             foretold = np.concatenate((np.zeros_like(y), bank.foretold[:, :-l]), axis=1)
             hindsight = missed, foretold, compared(bank.sums, foretold[:, -l:], missed[:, :l])
-            each = (mixed * self._begins) @ self._of_mixed + each[:, None]
+            each = (mixed * self._begins) @ self._everyday.of_mixed + each[:, None]
             seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:])
             innovations = each[:, :, n_z : n_z + l].reshape(len(y), -1)
             surprise = np.square(innovations @ filters.whiten.T) @ self._of_each.T
@@ -267,45 +272,21 @@ class LoadBank(Estimator):
                 c, surprise, moved, filters, bank.usual, bank.scale
             )
             correction = (innovations @ filters.gains.T).reshape(mixed.shape)
-            members = each[:, :, :n_z] * self._goes_on + self._damped(trust)[..., None] * correction
+            if self._damps:
+                correction *= trust[..., None]
+            members = each[:, :, :n_z] * self._goes_on + correction
             counts = (weights * trust).sum(axis=1, keepdims=True)
             estimate = self._estimate(members, weights, usual, scale, late, plain, counts, hindsight)
         return Updated(estimate, seen[:, :l], seen[:, l:])
 
-    def _everyday(self) -> tuple[Array, Array]:
-        """What `update` needs of a mixed z and of all else that is known, (u, v_last, v, y, 1, late, plain,
-        missed).
-
-        The map from z, transposed, is the same for all hypotheses: to z predicted, innovation and movement of the
-        outputs. That of the known has the same rows, and below them the next `late`, `plain` and `missed`.
-        """
-        model, k = self.model, self.loads.count
-        n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
-        sizes = (m, d, d, l, 1, len(self._of_late), n + l + m, len(self._hindsight.misses))
-        u, v_last, v, y, one, late, plain, missed = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
-        op = np.outer(model.all_inputs_op, one)
-        drive = model.B @ (np.vstack([u, v_last]) - op)
-        surplus = y - np.outer(model.y_op, one) - model.D @ (np.vstack([u, v]) - op)
-        A, C = self._A[0].copy(), self._C[0]
-        A[n : n + k, n + k :] = A[n + k :, n + k :] = np.eye(k)
-        of_z = np.vstack([A, -C @ A, model.C @ (A[:n] - np.eye(n, len(A)))])
-        driven = np.vstack([drive, np.zeros((2 * k, drive.shape[1]))])
-        of_plain, innovation = np.split(
-            self.plain.map[: n + l + m + l] @ np.vstack([plain, u, v_last, v, y, one]), [n + l + m]
-        )
-        of_missed = self._hindsight.misses @ np.vstack([missed, innovation / self.noise[:, None]])
-        of_late = self._of_late @ np.vstack([late, u])
-        of_known = np.vstack([driven, surplus - C @ driven, model.C @ drive, of_late, of_plain, of_missed])
-        return np.ascontiguousarray(of_z.T), of_known
-
     def predict(self, last: Estimate, u: Array, v: Array | None = None) -> BankEstimate:
         """One sample on, with the inputs u (m,) and disturbances v (d,) since."""
-        bank, model = _bank(last), self.model
+        bank, model = bank_estimate(last), self.model
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
         members = np.matmul(self._A, mixed[:, :, None])[:, :, 0]
         members[:, : model.n_states] += model.B @ self._change(u, v)
         late = self._of_late.dot(np.concatenate((bank.late, u)))
-        plain = _flat(self.plain.predict(self._plain_of(bank), u, v))
+        plain = self.plain.predict(self._plain_of(bank), u, v).flat
         counts, l = self._counts(c, late, bank.scale), model.n_outputs
         missed = self._hindsight.misses.dot(np.concatenate((bank.missed, self._nothing)))
         hindsight = missed, np.concatenate((self._nothing, bank.foretold[:-l])), bank.sums
@@ -313,28 +294,30 @@ class LoadBank(Estimator):
 
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
         """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
-        bank, model = _bank(predicted), self.model
+        bank, model = bank_estimate(predicted), self.model
         expected = model.y_op + bank.weights @ self._seen(bank.members) + model.D @ self._change(u, v)
-        innovation: Array = y - expected
-        return innovation
+        return np.asarray(y - expected)
 
     def corrected(
         self, predicted: Estimate, innovation: Array, believed: BoolArray | None = None
     ) -> BankEstimate:
         """Correct with the innovation (l,) of the mixture, of which only the outputs `believed` count."""
-        bank, believed = _bank(predicted), self._all if believed is None else believed
+        bank, believed = bank_estimate(predicted), self._all if believed is None else believed
         seen, filters = self._seen(bank.members), self.filters(believed)
         innovation = np.where(believed, innovation, 0.0)
         each = innovation + bank.weights @ seen - seen
         plain, model = self._plain_of(bank), self.model
         seen_beside = bank.weights @ seen + self.plain.innovation(plain, model.u_op, model.y_op)
         off = np.where(believed, innovation + seen_beside, 0.0)
-        corrected = _flat(self.plain.corrected(plain, off, believed))
+        corrected = self.plain.corrected(plain, off, believed).flat
         missed, l = bank.missed.copy(), len(off)
         missed[:l] += off / self.noise
         missed[l : 2 * l] = off / self.noise
-        sums = compared(bank.sums, bank.foretold[-l:] * believed, missed[:l])
-        hindsight = missed, bank.foretold.copy(), sums
+        hindsight = (
+            missed,
+            bank.foretold.copy(),
+            compared(bank.sums, bank.foretold[-l:] * believed, missed[:l]),
+        )
         return self._weighed(
             bank.members, each.ravel(), bank.late, corrected, bank.weights, bank, filters, hindsight
         )
@@ -348,16 +331,9 @@ class LoadBank(Estimator):
         return filters
 
     def _weighed(
-        self,
-        members: Array,
-        innovations: Array,
-        late: Array,
-        plain: Array,
-        c: Array,
-        bank: BankEstimate,
-        filters: Filters,
-        hindsight: tuple[Array, Array, Array],
-    ) -> BankEstimate:
+        self, members: Array, innovations: Array, late: Array, plain: Array, c: Array, bank: BankEstimate,
+        filters: Filters, hindsight: tuple[Array, Array, Array],
+    ) -> BankEstimate:  # fmt: skip
         """The estimate after Bayes' rule.
 
         Args:
@@ -371,13 +347,10 @@ class LoadBank(Estimator):
         moved = filters.precisions.dot(np.square(late[self._moved]))
         trust, weights, usual, scale = self._mixing.one(c, surprise, moved, filters, bank.usual, bank.scale)
         correction = filters.gains.dot(innovations).reshape(members.shape)
-        correction *= self._damped(trust)[:, None]
+        if self._damps:
+            correction *= trust[:, None]
         correction += members
         return self._estimate(correction, weights, usual, scale, late, plain, weights.dot(trust), hindsight)
-
-    def _damped(self, trust: Array) -> Array:
-        """By what hypotheses correct less: not at all where a mode integrates or grows, and errors stay."""
-        return np.ones_like(trust) if self._remembers else trust
 
     def _counts(self, weights: Array, late: Array, scale: Array) -> float:
         """t of the bank, with every output believed."""
@@ -385,16 +358,9 @@ class LoadBank(Estimator):
         return float(weights.dot(self._mixing.trust(moved, scale)))
 
     def _estimate(
-        self,
-        members: Array,
-        weights: Array,
-        usual: Array,
-        scale: Array,
-        late: Array,
-        plain: Array,
-        counts: Any,
+        self, members: Array, weights: Array, usual: Array, scale: Array, late: Array, plain: Array, counts: Any,
         hindsight: tuple[Array, Array, Array],
-    ) -> BankEstimate:
+    ) -> BankEstimate:  # fmt: skip
         """The estimate whose plans count on the bank with the weight t, `counts`, times its share in hindsight, and
         else on the plain filter.
 
@@ -411,19 +377,9 @@ class LoadBank(Estimator):
         plan += counts * beside
         x, at_inputs, at_outputs = self._parts
         return BankEstimate(
-            plan[..., x],
-            plan[..., at_outputs],
-            plan[..., at_inputs],
-            members,
-            weights,
-            usual,
-            scale,
-            late,
-            plain,
-            missed,
-            foretold,
-            sums,
-        )
+            plan[..., x], plan[..., at_outputs], plan[..., at_inputs],
+            members, weights, usual, scale, late, plain, missed, foretold, sums,
+        )  # fmt: skip
 
     def _plain_of(self, bank: BankEstimate) -> Estimate:
         n, l = self.model.n_states, self.model.n_outputs
@@ -431,21 +387,9 @@ class LoadBank(Estimator):
 
     def _seen(self, members: Array) -> Array:
         """The outputs of every hypothesis beside those of the inputs, shape (B, l)."""
-        seen: Array = np.matmul(self._C, members[:, :, None])[:, :, 0]
-        return seen
+        return np.asarray(np.matmul(self._C, members[:, :, None])[:, :, 0])
 
     def _change(self, u: Array, v: Array | None) -> Array:
         """All inputs of the model as differences from the operating point, shape (m + d,)."""
         model = self.model
-        change: Array = np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op
-        return change
-
-
-def _flat(estimate: Estimate) -> Array:
-    return np.concatenate((estimate.x, estimate.output_disturbance, estimate.input_disturbance))
-
-
-def _bank(estimate: Estimate) -> BankEstimate:
-    if not isinstance(estimate, BankEstimate):
-        raise MampcError(f"estimate: expected one of a LoadBank, received {type(estimate).__name__}")
-    return estimate
+        return np.asarray(np.concatenate([u, model.v_op if v is None else v]) - model.all_inputs_op)

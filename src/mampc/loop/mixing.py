@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array, BoolArray
+from mampc.base.errors import MampcError
 from mampc.loop.estimator import Estimate
 from mampc.loop.hypotheses import Member
 
@@ -54,6 +55,13 @@ class BankEstimate(Estimate):
     missed: Array
     foretold: Array
     sums: Array
+
+
+def bank_estimate(estimate: Estimate) -> BankEstimate:
+    """The estimate itself, or `MampcError` where it is not one of a bank."""
+    if not isinstance(estimate, BankEstimate):
+        raise MampcError(f"estimate: expected one of a LoadBank, received {type(estimate).__name__}")
+    return estimate
 
 
 class Filters(NamedTuple):
