@@ -371,3 +371,19 @@ def test_where_a_second_move_does_not_pay_single_moves_are_priced_at_once(seed, 
     one = decide(problem, mampc.MoveRules(max_moves=1, min_size=size), x, reference).objective
     assert decision.status is Status.OPTIMAL
     assert decision.objective == pytest.approx(min(hold, one + price), rel=1e-9)
+
+
+@pytest.mark.parametrize("reference", np.linspace(0.1, 1.5, 8))
+@pytest.mark.parametrize("unit", [1.0, 1e-4])
+def test_a_single_move_away_from_a_limit_is_none_or_of_least_size(reference, unit):
+    """The least size is more than half of what the input may do, so that its sign is known and its size is not."""
+    model = mampc.StateSpace([[0.5]], [[1.0 / unit]], [[1.0]], None, 1.0)
+    problem = mampc.TrackingProblem(
+        model, prediction_horizon=1, control_horizon=1, limits=mampc.Limits(u_min=0.0, u_max=1.5 * unit)
+    )
+    decision = decide(problem, mampc.MoveRules(min_size=unit), np.zeros(1), [reference])
+    weight = float(problem.move_weight[0, 0]) * unit**2
+    moves = np.array([0.0, np.clip(reference / (1 + weight), 1.0, 1.5)])
+    best = moves[np.argmin((reference - moves) ** 2 + weight * moves**2)]
+    assert decision.status is mampc.Status.OPTIMAL
+    np.testing.assert_allclose(decision.changes.ravel(), best * unit, rtol=1e-9, atol=1e-12 * unit)

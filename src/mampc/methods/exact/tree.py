@@ -356,8 +356,8 @@ class _BatchSearch:
                 positions = leaves.chosen[row][leaves.chosen[row] >= 0]
                 if self._of.sized:
                     low, high = leaves.low[row, : len(positions)], leaves.high[row, : len(positions)]
-                    sized = self._of.min_size[self._order[positions]] > 0
-                    within = None if (sized & (low < 0) & (high > 0)).any() else (low, high)
+                    size = self._of.min_size[self._order[positions]]
+                    within = None if ((low < size) & (high > -size) & (size > 0)).any() else (low, high)
                 found = problem.offer(problem.pattern(positions), within)
                 leaves.bound[row] = np.inf
                 leaves = self._priced(leaves, found)
