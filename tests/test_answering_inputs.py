@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from mampc import IOData
+from mampc import IOData, prbs
 from mampc.identification.excitation import answering
 
 
@@ -29,3 +30,11 @@ def test_a_controller_without_a_test_is_named_in_any_units(load, scale):
     assert "u1 follows from the outputs" in said
     assert answering(loop(1.0, 1.0, load, scale)) == []
     assert answering(loop(1.0, 0.0, load, scale)) == []
+
+
+def test_a_test_of_two_levels_seen_within_the_sample_is_not_named():
+    """Means over a sample show at once what an input does, and a random test moves at half of the samples."""
+    u = prbs(order=9, hold=1, samples=1022)
+    y = lfilter([0.15, 0.13], [1.0, -0.72], u[:, 0])[:, None]
+    y = y + 0.003 * np.random.default_rng(0).standard_normal(y.shape)
+    assert answering([IOData(u, y, 1.0)]) == []

@@ -88,3 +88,12 @@ def test_a_resonance_whose_frequency_and_dead_time_are_off_costs_little_more_tha
         batch = mampc.simulate_batch(plant, regulator, reference, noise=0.005, seeds=range(3), progress=False)
         cost.append(8 * np.square(batch.y - batch.r).sum() + 0.1 * np.count_nonzero(np.diff(batch.u, axis=1)))
     assert cost[0] < 1.5 * cost[1]
+
+
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("seed", range(4))
+def test_integrators_in_a_row_do_not_resonate_in_any_coordinates(order, seed):
+    T = np.random.default_rng(seed).standard_normal((order, order))
+    A = np.linalg.solve(T, (np.eye(order) + np.eye(order, k=1)) @ T)
+    model = mampc.StateSpace(A, np.linalg.inv(T)[:, -1:], T[:1], None, 1.0)
+    assert not resonates(model)

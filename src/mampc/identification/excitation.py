@@ -15,6 +15,7 @@ from mampc.systems.state_space import StateSpace
 
 BLOCK = 50_000  # samples looked at together
 FEW_MOVES = 10  # of an input; fewer say little about anything but the largest of them
+MOVING = 0.75  # share of samples at which controllers move; tests of two levels move at half of them
 TOGETHER = 0.9  # correlation of moves from which two inputs cannot be told apart
 SHORT = 5.0  # settling times: a shorter record has hardly one step of each kind
 LONG_ENOUGH = 12  # settling times
@@ -80,11 +81,12 @@ def answering(records: Sequence[IOData]) -> list[str]:
     seen = (seen - seen.mean(axis=0))[:, spread > 0] / spread[spread > 0]
     new, seen = u[LAGS:] - own @ (own.T @ u[LAGS:]), seen - own @ (own.T @ seen)
     left = new - seen @ np.linalg.lstsq(seen, new, rcond=1e-10)[0]
-    moved = np.mean(np.diff(u, axis=0) != 0, axis=0) > 0.5
+    moved = np.mean(np.diff(u, axis=0) != 0, axis=0) > MOVING
     answers = moved & (np.sum(left**2, axis=0) < (1 - ANSWERS) * np.sum(new**2, axis=0))
     return [
-        f"{name} follows from the outputs but for 1 %: a controller moved it, and the model may say more of that and "
-        "of loads than of the plant, whatever its fit and deviations; record a test, or changes of its set point"
+        f"{name} follows from the outputs but for 1 %: unless they show it within a sample, a controller moved it, and "
+        "the model may say more of that and of loads than of the plant, whatever its fit and deviations; "
+        "record a test, or changes of its set point"
         for name, follows in zip(longest.names.inputs, answers, strict=False)
         if follows
     ]

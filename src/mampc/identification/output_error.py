@@ -17,7 +17,7 @@ from mampc.base.checks import Array
 from mampc.identification.scaling import Scaled
 
 NUMBERS = 100_000  # in the equations of one step
-STEPS, HALVINGS = 15, 3
+STEPS, TRIES = 15, 3  # and lengths of each step, which are quarters of one another
 SETTLED = 1e-4  # of the sum of squares
 EDGE = 1 - 1e-9  # largest pole
 
@@ -41,8 +41,8 @@ def least_output_error(a: Array, records: Scaled, first: int) -> Array:
     a = stable(a)
     found = _fit(a, records, first)
     for _ in range(STEPS):
-        for halved in range(HALVINGS):
-            further = stable(a + found.step / 4**halved)
+        for shortened in range(TRIES):
+            further = stable(a + found.step / 4**shortened)
             tried = _fit(further, records, first)
             if tried.squares < found.squares:
                 break
@@ -56,7 +56,7 @@ def least_output_error(a: Array, records: Scaled, first: int) -> Array:
 
 
 def stable(a: Array) -> Array:
-    """Poles outside the unit circle mirrored to its inside."""
+    """Poles outside the unit circle mirrored to its inside, as far as rounded coefficients can say."""
     poles = np.roots(np.concatenate([[1.0], -a]))
     size = np.maximum(np.abs(poles), 1e-300)
     inside = np.where(size > EDGE, poles / size * np.minimum(1 / size, EDGE), poles)

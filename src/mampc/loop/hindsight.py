@@ -28,6 +28,7 @@ from mampc.systems.state_space import StateSpace
 UNPROVEN = 10.0  # samples with differences like the noise that speak as loudly as those seen
 AHEAD = int(2 * LATE)  # samples after the longest dead time at which what was foretold is compared
 FAST = 0.6  # size of the poles below which a mode is over soon; those of dead times are there, for rounding
+SWINGS = 1e-3  # angle from which a pair of poles swings: rounding parts up to four equal ones by less
 MOST, FURTHEST = 1e8, 1e9  # that a sample counts in either sum, so that they stay numbers
 
 
@@ -74,7 +75,7 @@ def resonates(model: StateSpace) -> bool:
     """Whether a mode swings with a damping below 1 / sqrt(2), and for more than a few samples."""
     poles = model.poles().astype(complex)
     slow = np.log(poles[np.abs(poles) > FAST])
-    return bool((-slow.real < np.sqrt(0.5) * np.abs(slow))[np.abs(slow.imag) > 1e-6].any())
+    return bool((-slow.real < np.sqrt(0.5) * np.abs(slow))[np.abs(slow.imag) > SWINGS].any())
 
 
 def compared(sums: Array, foretold: Array, missed: Array) -> Array:

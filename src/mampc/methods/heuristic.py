@@ -112,10 +112,9 @@ class HeuristicSearch:
             while solved is None or perf_counter() < deadline:
                 pattern = next(proposals) if solved is None else proposals.send(solved)
                 solved = solver.offer(sample, pattern, best, deadline)
-            ended = Ended(best.solved)
+            ended, status = Ended(best.solved), Status.TIME_LIMIT
         except StopIteration as end:
             ended = end.value
-        status = Status.TIME_LIMIT if perf_counter() >= deadline else status
         best.offer(solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
         guess, remarks = self._shifted(ended.moves), self._remarks(allowance)
         if best.moves is not None:

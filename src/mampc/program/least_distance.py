@@ -46,7 +46,7 @@ class Nearest(NamedTuple):
 
 
 class NearestOfEach(NamedTuple):
-    """`Nearest` of K programs: moves (K, moves) and multipliers (K, bounds), zero where the status is not OPTIMAL."""
+    """`Nearest` of K programs: moves (K, moves) and multipliers (K, bounds), of the OPTIMAL ones alone."""
 
     moves: Array
     multipliers: Array
