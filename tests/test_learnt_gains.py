@@ -9,6 +9,7 @@ import mampc
 from builders import random_model
 from mampc import loads
 from mampc.loop.learnt_gains import MOST, with_gains
+from seeds import seeds
 
 NOISE = np.array([0.05, 0.1])
 MODEL = mampc.StateSpace.from_first_order(
@@ -115,3 +116,40 @@ def test_what_cannot_be_learnt_is_refused():
             mampc.learn_gains(MODEL, records, noise=NOISE)
     with pytest.raises(mampc.MampcError, match="noise"):
         mampc.learn_gains(MODEL, run)
+
+
+@pytest.mark.parametrize("seed", seeds(6, quick=2))
+def test_a_loop_goes_on_with_learnt_gains_without_a_bump_and_with_less_error(seed):
+    """Begun from the inputs so far and the present measurements, in a steady state."""
+    plant, rng = mampc.Mismatch(gain=0.25).drawn(MODEL, seed=seed), np.random.default_rng(seed)
+    reference = np.tile(np.repeat([[1.0, -1.0], [0.0, 0.0]], 100, axis=0), (2, 1))
+    noise = NOISE * rng.standard_normal((400, 2))
+
+    def regulator(model):
+        problem = mampc.TrackingProblem(
+            model, prediction_horizon=20, control_horizon=3, output_weight=1 / NOISE**2, move_weight=20.0
+        )
+        return mampc.Regulator(
+            mampc.MAMPC(problem, mampc.MoveRules(price=30.0)), mampc.LoadBank(model, noise=NOISE)
+        )
+
+    def went_on(loop, state, x, samples):
+        u, y = [], []
+        for k in samples:
+            y.append(plant.y_op + plant.C @ x + noise[k])
+            decision = loop.step(state, y[-1], reference[k])
+            state, x = decision.state, plant.A @ x + plant.B @ (decision.u - plant.u_op)
+            u.append(decision.u)
+        return np.array(u), np.array(y), state, x
+
+    old, first, second = regulator(MODEL), range(200), range(200, 400)
+    u, y, state, x = went_on(old, old.initial_state(), np.zeros(plant.n_states), first)
+    new = regulator(mampc.learn_gains(MODEL, mampc.IOData(u, y, MODEL.dt), noise=NOISE).model)
+    kept = went_on(old, state, x, second)
+    learnt = went_on(new, new.initial_state(u[-10:], y[-1]), x, second)
+    error, moves = [], []
+    for inputs, outputs, *_ in (kept, learnt):
+        error.append(np.mean(((outputs - reference[200:]) / NOISE) ** 2))
+        moves.append(np.count_nonzero(np.diff(np.vstack([u[-1:], inputs[:10]]), axis=0)))
+    assert error[1] < 1.02 * error[0]
+    assert moves[1] <= moves[0] + 1
