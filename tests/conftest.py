@@ -52,10 +52,8 @@ def certify(program, f, lower, upper, solution):
     z, pull = solution.z, solution.multipliers
     bounds = np.concatenate([lower, upper])
     bounds = bounds[np.abs(bounds) < UNBOUNDED]
-    size = max(1.0, np.max(np.abs(program.rows(z)), initial=0.0), np.max(np.abs(bounds), initial=0.0))
-    gradient = max(
-        1.0, np.max(np.abs(f)), np.max(np.abs(program.H)) * np.max(np.abs(z)), np.max(np.abs(pull), initial=0)
-    )
+    size = max(1.0, largest(program.rows(z)), largest(bounds))
+    gradient = max(1.0, largest(f), largest(program.H) * largest(z), largest(pull))
     assert program.primal_residual(lower, upper, solution) <= TOLERANCE * size
     assert program.dual_residual(f, solution) <= TOLERANCE * gradient
     assert program.duality_gap(lower, upper, solution) <= TOLERANCE * gradient * size
