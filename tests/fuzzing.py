@@ -293,7 +293,9 @@ class Believed:
             beyond = 100.0 * apart if apart > 0 else np.inf
             low, high = self._limits.u_min[i] - beyond, self._limits.u_max[i] + beyond
             if abs(value) < 5e11 and low < value < high:
-                tolerance = 0.01 * apart if np.isfinite(apart) else 1e-6
+                late, offset = self._answers[i]
+                expected = self.commands[-1 - late][i] + offset
+                tolerance = 0.01 * apart if np.isfinite(apart) else 1e-6 * max(abs(value), abs(expected))
                 answer = self._answer(i, value, tolerance)
                 if by_hand:
                     answer = None if abs(value - self.commands[-1][i]) > 0.1 * tolerance else (0, 0.0)

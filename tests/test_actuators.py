@@ -151,9 +151,9 @@ def test_a_late_actuator_that_is_told_is_no_worse_than_one_that_is_not(either_es
         assert (np.diff(applied[60:100]) != 0).sum() <= most
 
 
-def memory_after(told, decided=(0.0, 10.0, 16.0, 21.0), by_hand=None):
+def memory_after(told, decided=(0.0, 10.0, 16.0, 21.0), by_hand=None, limits=PROBLEM.limits):
     """What is believed of the latest inputs, after each sample's told one and before its decision."""
-    actuators, believed = Actuators(PROBLEM.limits), []
+    actuators, believed = Actuators(limits), []
     inputs = np.zeros((4, 1))
     state = actuators.initial(inputs)
     for now, u in zip(told, decided, strict=True):
@@ -196,6 +196,16 @@ def test_what_an_input_in_manual_does_is_no_answer_to_what_was_decided():
     assert [row[-1] for row in in_manual] == told
     not_told_so = memory_after(told, [0.0, 3.0, 3.0, 9.0])
     assert [row[-1] for row in not_told_so] == [0.0, 3.0, 3.0, 9.0]
+
+
+@pytest.mark.parametrize("told", [[0.0, 0.0, 7.0, 7.0], [0.0, 0.0, 10.0, 16.0], [0.0, 10.5, 16.5, 21.5]])
+def test_the_unit_of_an_input_without_a_range_decides_nothing(told):
+    limits = mampc.TrackingProblem(FIRST_ORDER, prediction_horizon=20, control_horizon=5).limits
+    decided = np.array([0.0, 10.0, 16.0, 21.0])
+    believed = memory_after(told, decided, limits=limits)
+    for unit in (2.0**-30, 2.0**30):  # powers of two, which change no digit
+        scaled = memory_after(unit * np.array(told), unit * decided, limits=limits)
+        np.testing.assert_array_equal(scaled, unit * np.array(believed))
 
 
 TOLD = st.one_of(

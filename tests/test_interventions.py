@@ -144,3 +144,8 @@ def test_a_study_says_what_operators_do_and_its_trajectory_replays(tmp_path):
     assert "all 20 decisions" in outcome.output, outcome.output
     with pytest.raises(mampc.StudyError, match="manual: expected one of u1, u2"):
         run_study(parse_study(STUDY.replace('"u1"', '"u9"'), folder=tmp_path))
+
+
+def test_an_input_that_is_by_hand_at_no_sample_is_refused():
+    with pytest.raises(mampc.StudyError, match="expected until beyond at, which is 6; received 6"):
+        parse_study(STUDY.replace("until = 9", "until = 6"))

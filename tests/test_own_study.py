@@ -276,6 +276,23 @@ def test_a_reference_out_of_reach_and_changes_too_late_are_told(tmp_path):
     _, (warning,) = warned(tmp_path, ("{ at = 5,", "{ at = 5000,"))
     assert "after the last sample" in warning
     assert "reference.changes at 5000" in warning
+    limits = '[[scenarios]]\nname = "later"\nlimits = [{ at = 5000, u_max = [0.5] }]\n\n[[controllers]]\nname = "MPC"'
+    _, (warning,) = warned(tmp_path, ('[[controllers]]\nname = "MPC"', limits))
+    assert "limits of 'later' at 5000" in warning
+
+
+def test_the_least_and_the_largest_of_many_references_are_looked_at(tmp_path):
+    study, _ = warned(tmp_path)
+    problem = problem_of(study, StateSpace.load(tmp_path / "model.json"))
+    price = study.controllers[1].rules.price
+    rules = study.controllers[1].rules.model_copy(
+        update={"price": 50 * price}
+    )  # of a change by 0.6, at most 64
+    dear = study.controllers[1].model_copy(update={"rules": rules})
+    study = study.model_copy(update={"controllers": [study.controllers[0], dear]})
+    ramp = np.linspace(0.0, 0.6, 200)[:, None]
+    offsets = {table.name: np.zeros(1) for table in study.controllers}
+    assert cautions(study, problem, ramp, offsets) == ()
 
 
 def test_the_example_study_has_nothing_to_warn_of():

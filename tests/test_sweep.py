@@ -6,18 +6,21 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 import mampc
 from mampc.cli import app
+from mampc.cli.console import bar, console_for_tables
 from mampc.compare.fronts import Point, moves_at, non_dominated
 from mampc.compare.knobs import knob_of, variants
 from mampc.compare.sweep import Sweep, points_of, run_sweep
-from mampc.report.fronts import equal_error, write_rows
+from mampc.report.fronts import equal_error, front_tables, write_rows
 from mampc.study import parse_study
 from mampc.study.schema import ControllerTable
 from studies import MPC_AND_PRICE, short_study
@@ -236,6 +239,23 @@ def test_equal_error_compares_every_controller_with_plain_mpc(swept):
     sweep, _, rows = swept
     found = equal_error(rows, sweep.study.scenarios[0].name)
     assert set(found) == {"exact", "dead band"}
+
+
+def test_names_that_look_like_markup_stand_as_they_are(swept, capsys):
+    _, _, rows = swept
+    names = {"exact": "exact [red]", "dead band": "[/b]"}
+    named = [row | {"scenario": "[i]", "controller": names.get(row["controller"], "MPC")} for row in rows]
+    for table in front_tables(named):
+        console_for_tables().print(table)
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in ("[i]: moves", *names.values()))
+
+
+def test_a_bar_bears_any_file_name(monkeypatch, capsys):
+    monkeypatch.setattr("mampc.cli.console.Console", partial(Console, force_terminal=True, width=100))
+    with bar("{x} [/b].toml") as show:
+        show(1, 2)
+    assert "{x} [/b].toml" in capsys.readouterr().err
 
 
 def test_the_command_draws_and_tabulates(tmp_path, monkeypatch):

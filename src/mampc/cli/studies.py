@@ -127,7 +127,7 @@ def reproduce(
             console.print()
         for warning in case.result.warnings:
             complain(f"warning: {warning}")
-    console.print(f"Open {out / 'report.html'}", soft_wrap=True)
+    console.print(f"Open {out / 'report.html'}", soft_wrap=True, markup=False)
 
 
 @app.command()

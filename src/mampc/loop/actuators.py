@@ -20,7 +20,7 @@ from mampc.base.identity import equal_only_to_itself
 from mampc.program.problem import Limits
 
 TOLERANCE = 0.01  # of the range of an input: neither valves nor their position feedback are more exact
-UNKNOWN_RANGE = 1e-6  # input units, where an input has no range
+ROUNDED = 1e-6  # of an input without a range: what rounding may make of its report
 IN_MANUAL = 0.1  # times the tolerance of an input in manual, so that it goes back to automatic without a bump
 ABSURD = 100.0  # times the range of an input: no actuator is that far outside
 LATEST = 10  # samples that an actuator may be late by
@@ -60,8 +60,11 @@ class Actuators:
 
     def __init__(self, limits: Limits, tolerance: Array | None = None) -> None:
         apart = limits.u_max - limits.u_min
+        self._rounded = None  # share of what is reported, of inputs without a range
         if tolerance is None:
-            tolerance = np.where(np.isfinite(apart), TOLERANCE * apart, UNKNOWN_RANGE)
+            ranged = np.isfinite(apart)
+            tolerance = TOLERANCE * np.where(ranged, apart, 0.0)
+            self._rounded = None if ranged.all() else np.where(ranged, 0.0, ROUNDED)
         self._tolerance = tolerance
         beyond = np.where(apart > 0, ABSURD * apart, LARGEST)
         # Nor is it beyond what controllers decide where there are no limits: half of what counts as a number.
@@ -94,6 +97,8 @@ class Actuators:
         if late.any():
             answered = np.array(state.commands)[-1 - late.astype(np.intp), self._each]
         expected = answered + offset
+        if self._rounded is not None:
+            tolerance = tolerance + self._rounded * np.maximum(np.abs(reported), np.abs(expected))
         agrees = np.abs(reported - expected) <= tolerance
         stays = np.abs(reported - state.reported) <= tolerance
         careful = None if manual is None and not state.manual.any() else state.manual != 0

@@ -54,7 +54,7 @@ class Regulator:
             what it finds; for noise that was guessed. Needs `value_of_information` and an exact search by a table.
         applied_tolerance: an applied input this near to the decided one is the decided one: valves and their
             position feedback are never exact. In input units, a scalar or (m,); default a hundredth of the
-            input's range, or 1e-6 where that is not finite.
+            input's range, or 1e-6 of the input itself where that is not finite.
         reference_filter: lags and ramps between the references given and those tracked; default none. They start
             from the outputs, also when the last input comes back from manual.
         valves: what is known of valves that stick or have play. Then positions of their stems are planned, and inputs

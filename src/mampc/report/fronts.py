@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from mampc.base.drawing import legend_above, new_figure, plain, styled
@@ -60,9 +61,9 @@ def front_tables(rows: Rows) -> Iterator[Table]:
     for scenario in scenarios_of(rows):
         title = f"{scenario}: moves at equal error, in percent of plain MPC's (standard error)"
         headers = [f"{ratio:g} x MPC's error" for ratio in RATIOS]
-        table = Table("controller", *numbers(*headers), title=title, title_justify="left")
+        table = Table("controller", *numbers(*headers), title=escape(title), title_justify="left")
         for name, estimates in equal_error(rows, scenario).items():
-            table.add_row(name, *(_shown(estimates[ratio]) for ratio in RATIOS))
+            table.add_row(escape(name), *(_shown(estimates[ratio]) for ratio in RATIOS))
         yield table
 
 

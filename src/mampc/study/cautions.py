@@ -33,13 +33,23 @@ def cautions(
     """
     # A zone is as good as a set point for what happens beyond it.
     condensed = CondensedQP(replace(problem, zone_below=0.0, zone_above=0.0))
-    levels = np.unique(np.vstack([problem.model.y_op, reference]), axis=0)[:MOST_LEVELS]
+    levels = _some(np.unique(np.vstack([problem.model.y_op, reference]), axis=0))
     return (
         *_unstable(study, condensed),
         *_late(study),
         *_out_of_reach(condensed, levels, problem),
         *_never_pays(study, condensed, levels, offsets),
     )
+
+
+def _some(levels: Array) -> Array:
+    """Of many references some, with the least and the largest of each output."""
+    count = len(levels)
+    if count <= MOST_LEVELS:
+        return levels
+    evenly = np.linspace(0, count - 1, MOST_LEVELS).round().astype(int)
+    some: Array = levels[np.unique([*evenly, *levels.argmin(axis=0), *levels.argmax(axis=0)])]
+    return some
 
 
 def _unstable(study: Study, condensed: CondensedQP) -> list[str]:
@@ -61,6 +71,13 @@ def _late(study: Study) -> list[str]:
         f"{what} at {at}"
         for what, at in (
             *(("reference.changes", change.at) for change in study.reference.changes),
+            *(("reference.zones", zone.at) for zone in study.reference.zones),
+            *(
+                (f"{what} of {table.name!r}", change.at)
+                for table in study.scenarios
+                for what in ("switches", "limits", "manual")
+                for change in getattr(table, what)
+            ),
             *(
                 (f"disturbances of {table.name!r}", table.disturbance_at)
                 for table in study.scenarios

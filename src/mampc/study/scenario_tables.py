@@ -133,6 +133,12 @@ class ManualTable(Table):
     input: Word
     value: Number
 
+    @model_validator(mode="after")
+    def _lasts(self) -> ManualTable:
+        if self.until <= self.at:
+            raise ValueError(f"until beyond at, which is {self.at}; received {self.until}")
+        return self
+
 
 class ScenarioTable(Table):
     name: Name

@@ -298,7 +298,7 @@ def _localised(ticks: Ticks, zone: str, findings: Findings) -> Ticks:
     known = known.iloc[::-1] if backwards else known
     try:
         read = known.dt.tz_localize(zone, ambiguous="infer", nonexistent="NaT")
-    except ValueError as error:
+    except Exception as error:  # of pytz, and no ValueError, before pandas 3
         findings.doubt(f"the doubled hour at the end of summer time in {zone} cannot be told apart: {error}")
         read = known.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
     localised = ticks.copy()
