@@ -247,6 +247,16 @@ def test_rows_swallowed_by_a_quotation_mark_are_noticed(tmp_path):
         read(tmp_path, text(lines, header=("time", "u", "y", "remark")))
 
 
+def test_two_numbers_in_one_cell_are_none(tmp_path):
+    lines = [[time, '"1\n2"' if k == 3 else u, y] for k, (time, u, y) in enumerate(rows())]
+    with pytest.raises(MampcError, match="received a quoted field of several lines in row 6"):
+        read(tmp_path, text(lines))
+    frame = pd.DataFrame({"u": [str(u) for u in U], "y": Y})
+    frame.loc[3, "u"] = "1\n2"
+    with pytest.raises(MampcError, match=r"expected a number in row \d, column 'u', received '1\\n2'"):
+        read_export(frame, inputs="u", outputs="y", dt=60.0)
+
+
 def test_missing_columns_are_all_named_with_a_guess(tmp_path):
     with pytest.raises(MampcError) as refusal:
         read(tmp_path, text(rows(), header=("time", "Valve", "Level")), inputs="valve", outputs="Levl")

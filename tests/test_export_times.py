@@ -380,3 +380,28 @@ def test_times_of_their_own_for_each_column_are_refused(tmp_path):
         MampcError, match="received 2 called 'time' with different times; export all columns at the same"
     ):
         read(tmp_path, text(lines, header=("time", "u", "time", "y")))
+
+
+@pytest.mark.parametrize(
+    "stamp",
+    [
+        "0001-01-01T00:{:02d}:00+05:00",  # in UTC a year before the first
+        "9999-12-31 24:{:02d}:00",
+        "0000-04-13 09:{:02d}:00",
+    ],
+)
+def test_times_that_no_date_has_are_told(tmp_path, stamp):
+    lines = rows([stamp.format(k if "24:" not in stamp else 0) for k in range(len(U))])
+    with pytest.raises(MampcError, match="expected times in column 'time'"):
+        read(tmp_path, text(lines))
+
+
+def test_the_first_and_the_last_year_have_no_time_zone(tmp_path):
+    lines = rows([f"0001-01-01 00:{k:02d}:00" for k in range(len(U))])
+    with pytest.raises(MampcError, match="expected times in column 'time'"):
+        read(tmp_path, text(lines), time_zone="Pacific/Auckland")
+
+
+def test_a_format_with_a_field_twice_is_refused(tmp_path):
+    with pytest.raises(MampcError, match="time_format: expected a format as strptime has it"):
+        read(tmp_path, text(rows(stamps())), time_format="%Y-%m-%d %H:%M:%S %H")

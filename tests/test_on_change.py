@@ -63,6 +63,8 @@ def test_where_all_tags_are_stored_on_change_a_sample_time_is_asked_for(tmp_path
     table = text(lines, header=("time", "tag", "value"))
     with pytest.raises(MampcError, match="--dt"):
         read(tmp_path, table, on_change=["u", "y"])
+    with pytest.raises(MampcError, match="dt: expected at most 10000000 samples in"):
+        read(tmp_path, table, on_change=["u", "y"], dt=1e-9)
     [record] = read(tmp_path, table, on_change=["u", "y"], dt=10.0).records
     assert record.u[:, 0].tolist() == [1, 1, 1, 3, 3, 3, 5]
     assert record.y[:, 0].tolist() == [2, 2, 2, 2, 2, 4, 4]

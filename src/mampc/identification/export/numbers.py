@@ -167,7 +167,7 @@ class _Reader:
             if self.decimal == ",":
                 text = text.translate(SWAPPED)
             plain = None
-            if PLAIN_CHARACTERS.issuperset(text):
+            if PLAIN_CHARACTERS.issuperset(text) and text.count("\n") == len(cells) - 1:
                 try:
                     plain = [float(word) for word in text.split("\n")]
                 except ValueError:

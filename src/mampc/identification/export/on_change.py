@@ -15,6 +15,7 @@ from mampc.identification.export.findings import Findings
 from mampc.identification.export.sheet import Sheet
 
 RARE = 0.5  # of the rows in which others have values: a column with fewer may be stored on change only
+MOST_SAMPLES = 10_000_000  # made of values that are all held
 
 
 def hold_last(
@@ -90,6 +91,12 @@ def sampled(
             )
             return clock, values, numbers
         seconds = clock.seconds[order]
+        if not (seconds[-1] - seconds[0]) / dt < MOST_SAMPLES:
+            findings.doubt(
+                f"dt: expected at most {MOST_SAMPLES} samples in {seconds[-1] - seconds[0]:.6g} s, received one every "
+                f"{dt:.6g} s"
+            )
+            return clock, values, numbers
         times = np.arange(seconds[0], seconds[-1] + dt / 2, dt)
         order = order[np.searchsorted(seconds, times, side="right") - 1]
         return replace(clock, seconds=times), values[order], numbers[order]

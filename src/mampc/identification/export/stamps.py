@@ -57,6 +57,8 @@ DECIMAL = re.compile(r"(\d),(\d)")
 DIGIT, LETTER = re.compile(r"\d"), re.compile(r"[^\W\d_]")
 FIELD = re.compile(r"%.|\w|\s")
 NEVER = np.iinfo(np.int64).min  # among ticks, as numpy has it
+# Ticks of years that dates have, a day from their ends, which offsets and clocks put back may take.
+EARLIEST, LATEST = (np.datetime64(day, "us").astype(np.int64).item() for day in ("0001-01-02", "9999-12-30"))
 
 Ticks = npt.NDArray[np.int64]  # microseconds since 1970, in UTC or in local time
 
@@ -108,6 +110,8 @@ def plain_stamps(blocks: Iterable[Sequence[Cells]]) -> tuple[Array, datetime] | 
             return None
     ticks = np.concatenate(parts)
     first = int(ticks.min())
+    if not EARLIEST <= first <= ticks.max() <= LATEST:
+        return None
     ticks -= first
     seconds: Array = ticks / 1e6
     return seconds, _moment(first)
@@ -251,7 +255,7 @@ def _parsed(words: Any, form: str, utc: bool) -> Any:
 
     try:
         return pd.to_datetime(words, format=form, errors="coerce", utc=utc)
-    except ValueError as error:
+    except (ValueError, re.error) as error:  # the latter of a field that stands twice
         raise MampcError(f"time_format: expected a format as strptime has it, received {error}") from None
 
 
@@ -274,7 +278,7 @@ def since_first(
     """Seconds after the earliest stamp, and that stamp, in UTC where it has a zone."""
     if how.time_zone is not None and not in_utc:
         ticks, in_utc = _localised(ticks, how.time_zone, findings), True
-    known = ticks != NEVER
+    known = (ticks >= EARLIEST) & (ticks <= LATEST)
     if not known.any():
         return np.full(len(ticks), np.nan), None
     first = int(ticks[known].min())
