@@ -26,7 +26,7 @@ import numpy as np
 from joblib import Parallel, delayed
 
 import mampc
-from attention_cases import LOADS, STEPS, Case, cases, load_of, per_input, problem_of, reference_of
+from attention_cases import LOADS, STEPS, Case, cases, load_of, per_input, points_of, problem_of, reference_of
 from attention_limits import SCENARIOS, limit
 from mampc import rivals
 from mampc.compare.fronts import Point, moves_at
@@ -121,15 +121,7 @@ def measured(
 ) -> list[Point]:
     """A method over its knob, in the same scenarios at every value; loads are sized for the case, or another one."""
     regulators = regulators_of(case, method, structure, knobs)
-    batch = mampc.simulate_batch(
-        case.plant, [own for own in regulators for _ in seeds], reference_of(case), seeds=[*seeds] * len(knobs),
-        noise=case.noise, loads=load_of(kind, sized_for or case), progress=False,
-    )  # fmt: skip
-    moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2)).reshape(-1, len(seeds))
-    error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2)).reshape(-1, len(seeds))
-    return [
-        Point(method, float(knob), m.astype(float), e) for knob, m, e in zip(knobs, moves, error, strict=True)
-    ]
+    return points_of(case, kind, method, regulators, seeds, knobs=knobs, sized_for=sized_for)
 
 
 @cache

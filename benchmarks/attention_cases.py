@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 import mampc
 from mampc import loads
+from mampc.compare.fronts import Point
 
 STEPS = 200
 LOADS = ("none", "steps", "wandering", "coloured", "sinusoidal")
@@ -95,3 +97,34 @@ def problem_of(
         case.model, prediction_horizon=case.horizon, control_horizon=moves, output_weight=1 / case.noise**2,
         move_weight=weight, limits=case.limits, tail_horizon=tail,
     )  # fmt: skip
+
+
+def points_of(
+    case: Case,
+    kind: str,
+    method: str,
+    regulators: Sequence[mampc.Regulator],
+    seeds: range,
+    *,
+    knobs: Sequence[float] | None = None,
+    sized_for: Case | None = None,
+) -> list[Point]:
+    """Moves and errors of regulators, each at its knob, in the same scenarios; loads sized for this case or another."""
+    batch = mampc.simulate_batch(
+        case.plant, [own for own in regulators for _ in seeds], reference_of(case), seeds=[*seeds] * len(regulators),
+        noise=case.noise, loads=load_of(kind, sized_for or case), progress=False,
+    )  # fmt: skip
+    moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2)).reshape(-1, len(seeds))
+    error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2)).reshape(-1, len(seeds))
+    knobs = range(len(regulators)) if knobs is None else knobs
+    return [
+        Point(method, float(knob), m.astype(float), e) for knob, m, e in zip(knobs, moves, error, strict=True)
+    ]
+
+
+def plain_mpc(case: Case, kind: str, seeds: range) -> Point:
+    """Plain MPC, which others are compared with."""
+    estimator = mampc.KalmanFilter.offset_free(
+        case.model, measurement_noise=case.noise, drift=0.3 * case.noise
+    )
+    return points_of(case, kind, "MPC", [mampc.Regulator(mampc.MPC(problem_of(case)), estimator)], seeds)[0]

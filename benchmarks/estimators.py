@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 import mampc
-from attention_cases import Case, cases, load_of, problem_of, reference_of
-from mampc.compare.fronts import Point, moves_at
+from attention_cases import Case, cases, plain_mpc, points_of, problem_of
+from mampc.compare.fronts import moves_at
 from measuring import options
 
 LOADS = ("none", "steps", "wandering")
@@ -36,20 +36,6 @@ def regulators(case: Case, problem: mampc.TrackingProblem, name: str) -> list[ma
     ]
 
 
-def points(case: Case, load: str, made: list[mampc.Regulator], name: str) -> list[Point]:
-    """Moves and errors of each regulator in the same scenarios."""
-    batch = mampc.simulate_batch(
-        case.plant, [own for own in made for _ in SEEDS], reference_of(case), seeds=[*SEEDS] * len(made),
-        noise=case.noise, loads=load_of(load, case), progress=False,
-    )  # fmt: skip
-    moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2)).reshape(-1, len(SEEDS))
-    error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2)).reshape(-1, len(SEEDS))
-    return [
-        Point(name, float(k), m.astype(float), e)
-        for k, (m, e) in enumerate(zip(moves, error, strict=True), 1)
-    ]
-
-
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--plants", nargs="*", default=[*cases()], help="only these")
@@ -57,15 +43,13 @@ def main() -> None:
     for name in parser.parse_args().plants:
         case = cases()[name]
         for load in LOADS:
-            plain = problem_of(case)
-            filtered = mampc.KalmanFilter.offset_free(
-                case.model, measurement_noise=case.noise, drift=0.3 * case.noise
-            )
-            (base,) = points(case, load, [mampc.Regulator(mampc.MPC(plain), filtered)], "MPC")
+            base = plain_mpc(case, load, SEEDS)
             for setting, settings in SETTINGS.items():
                 problem = problem_of(case, moves=3, **settings)
                 found = [
-                    moves_at(points(case, load, regulators(case, problem, each), each), base, RATIO).value
+                    moves_at(
+                        points_of(case, load, each, regulators(case, problem, each), SEEDS), base, RATIO
+                    ).value
                     for each in ESTIMATORS
                 ]
                 ratios[setting].append([value / found[0] for value in found])

@@ -15,11 +15,13 @@ N = (6 price / s)^(1/3) / 6; coloured loads as the walk that they are at first.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 import mampc
-from attention_cases import LOADS, Case, cases, load_of, problem_of, reference_of
-from mampc.compare.fronts import Estimate, Point, moves_at
+from attention_cases import LOADS, Case, cases, plain_mpc, points_of, problem_of
+from mampc.compare.fronts import Estimate, moves_at
 from measuring import options
 
 PRICES, SEEDS, RATIO = 100 * np.geomspace(1 / 10, 30, 7), range(3000, 3004), 1.25
@@ -47,36 +49,19 @@ def regulator(case: Case, tail: float, price: float) -> mampc.Regulator:
     return mampc.Regulator(controller, bank, value_of_information=True)
 
 
-def points(case: Case, kind: str, made: list[mampc.Regulator], name: str) -> list[Point]:
-    """Moves and errors of each regulator in the same scenarios."""
-    batch = mampc.simulate_batch(
-        case.plant, [own for own in made for _ in SEEDS], reference_of(case), seeds=[*SEEDS] * len(made),
-        noise=case.noise, loads=load_of(kind, case), progress=False,
-    )  # fmt: skip
-    moves = np.count_nonzero(np.abs(np.diff(batch.u, axis=1)) > 1e-9, axis=(1, 2)).reshape(-1, len(SEEDS))
-    error = np.mean(((batch.y - batch.r) / case.noise) ** 2, axis=(1, 2)).reshape(-1, len(SEEDS))
-    return [
-        Point(name, float(k), m.astype(float), e) for k, (m, e) in enumerate(zip(moves, error, strict=True))
-    ]
-
-
 def compared(name: str, kind: str) -> list[Estimate]:
     """Moves over plain MPC's with each of the tails."""
     case = cases()[name]
     h = case.horizon
-    filtered = mampc.KalmanFilter.offset_free(
-        case.model, measurement_noise=case.noise, drift=0.3 * case.noise
-    )
-    (base,) = points(case, kind, [mampc.Regulator(mampc.MPC(problem_of(case)), filtered)], "MPC")
+    base = plain_mpc(case, kind, SEEDS)
     formula = [max(follows(kind, case, price) - h, 0.0) for price in PRICES]
     tails = ([0.0] * len(PRICES), [h / 4] * len(PRICES), [float(h)] * len(PRICES), formula)
     return [
         moves_at(
-            points(case, kind, [regulator(case, L, p) for L, p in zip(each, PRICES, strict=True)], tail),
-            base, RATIO,
+            points_of(case, kind, tail, [*map(partial(regulator, case), each, PRICES)], SEEDS), base, RATIO
         )
         for tail, each in zip(TAILS, tails, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def main() -> None:
