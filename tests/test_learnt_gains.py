@@ -107,10 +107,12 @@ def test_what_cannot_be_learnt_is_refused():
         data = mampc.IOData(np.zeros((80, 2)), np.zeros((80, model.n_outputs)), 10.0)
         with pytest.raises(mampc.MampcError, match="stand in for"):
             mampc.learn_gains(model, data, noise=0.1)
+    missing = np.where(run.t[:, None] == 400.0, np.nan, run.y)
     for records, words in (
         ([], "at least one"), (3, "records"), ([3], "IOData or runs"),
         (mampc.IOData(run.u, run.y, 5.0), "sample time"), (mampc.IOData(run.u[:, :1], run.y, 10.0), "2 inputs"),
         (mampc.IOData(run.u[:20], run.y[:20], 10.0), "60 samples"),
+        (replace(run, y_measured=missing), r"received nan at \[40, 0\]"),
     ):  # fmt: skip
         with pytest.raises(mampc.MampcError, match=words):
             mampc.learn_gains(MODEL, records, noise=NOISE)

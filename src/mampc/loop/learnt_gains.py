@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_vector
+from mampc.base.checks import Array, as_vector, require_finite
 from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
 from mampc.loop.disturbances import response_within_reach
@@ -161,7 +161,7 @@ def _signals(record: Any, model: StateSpace) -> tuple[Array, Array]:
         )
     if not np.isclose(dt, model.dt, rtol=1e-6):
         raise MampcError(f"records: expected the model's sample time of {model.dt:g} s, received {dt:g} s")
-    return u - model.all_inputs_op, y - model.y_op
+    return require_finite("records", u) - model.all_inputs_op, require_finite("records", y) - model.y_op
 
 
 def _require_apart(model: StateSpace, noise: Array) -> None:
