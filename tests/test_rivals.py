@@ -310,6 +310,19 @@ def test_units_decide_nothing(name):
     np.testing.assert_allclose(inputs(scale), inputs(np.ones(2)), rtol=1e-4, atol=1e-3)
 
 
+def test_small_inputs_move_beside_large_ones():
+    def changes(scale):
+        model = tank_model()
+        other = mampc.StateSpace(
+            model.A, model.B / scale, model.C, model.D / scale, model.dt, model.u_op * scale, model.y_op
+        )
+        problem = tank_problem(other, limits=mampc.Limits(), move_weight=0.1 / scale**2)
+        controller = rivals.SparseInputs(problem, most=1)
+        return controller.step(controller.initial_state(), np.zeros(4), [34.0, 28.0]).changes / scale
+
+    np.testing.assert_allclose(changes(np.array([1e-9, 1e6])), changes(np.ones(2)), rtol=1e-6, atol=1e-6)
+
+
 def test_a_dead_band_moves_by_more_than_its_size_or_not_at_all():
     problem = tank_problem()
     run = mampc.simulate(

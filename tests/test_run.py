@@ -33,6 +33,17 @@ def test_errors_are_weighed_as_told(weight, expected):
     assert metrics.tracking_error == pytest.approx(41.0)
 
 
+@pytest.mark.parametrize("unit", [1.0, 2.0**-80, 2.0**40])
+def test_gaps_are_shares_of_costs_in_whatever_unit(unit):
+    controller = mampc.MPC(tank_problem())
+    made = controller.step(controller.initial_state(), np.zeros(4), tank_reference(1)[0])
+    costs = [(4.0, 3.0), (2.0, 2.0), (np.nan, -np.inf), (8.0, -np.inf), (1e-30, 0.0)]
+    decisions = tuple(made._replace(objective=unit * cost, lower_bound=unit * bound) for cost, bound in costs)
+    np.testing.assert_allclose(
+        replace(hand_made_run(), decisions=decisions).gaps, [0.25, 0.0, np.nan, np.inf, 1.25e-19]
+    )
+
+
 def test_metrics_equal_those_worked_out_by_hand():
     metrics = hand_made_run().metrics(threshold=0.1)  # changes: (1, 0), (0, .05), (2, 0), (-.5, -.05), (0, 0)
     np.testing.assert_allclose(metrics.sparse_density, [3 / 5, 0.0])

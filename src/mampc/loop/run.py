@@ -27,6 +27,7 @@ DECIDED = (
     "status", "objective", "lower_bound", "iterations", "solve_time_us", "remarks", "ignored", "load", "variant",
 )  # fmt: skip
 ENDS = ("zone_low", "zone_high")  # of zones, in names of columns
+ROUNDED = 1e-12  # of the largest cost in a run: one at rest is rounding
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -110,7 +111,10 @@ class Run:
         """
         objective = np.array([decision.objective for decision in self.decisions])
         gap = np.array([decision.gap for decision in self.decisions])
-        shares: Array = np.where(gap > 0, gap / np.maximum(np.abs(objective), 1e-12), gap)
+        cost = np.abs(objective)
+        cost = np.maximum(cost, ROUNDED * np.fmax.reduce(cost, initial=0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares: Array = np.where(gap > 0, gap / cost, gap)
         return np.where(np.isnan(objective), np.nan, shares)
 
     @property

@@ -25,6 +25,7 @@ from mampc.program.sample import Sample
 from mampc.program.steady import SteadyTarget
 
 MOST_PATTERNS = 5000
+ROUNDED = 1e-12  # of the size of an input: a change that is none
 
 
 class SparseInputs(Controller):
@@ -108,7 +109,9 @@ class SparseInputs(Controller):
                 best, least = moves, cost
         if best is None:
             return Plan(None, HELD_BY[failure], solved)
-        best[np.abs(best) <= 1e-12 * np.abs(start).max(initial=1.0)] = 0.0
+        each = best.reshape(-1, self.problem.model.n_inputs)  # what is rounding beside the input's own values
+        size = np.maximum(np.abs(start.reshape(each.shape)), np.abs(each)).max(axis=0)
+        each[np.abs(each) <= ROUNDED * size] = 0.0
         return Plan(best, Status.OPTIMAL, solved, None)
 
     def _solver_on(self, index: int) -> DaqpSolver:
