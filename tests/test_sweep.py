@@ -20,7 +20,7 @@ from mampc.cli.console import bar, console_for_tables
 from mampc.compare.fronts import Point, moves_at, non_dominated
 from mampc.compare.knobs import knob_of, variants
 from mampc.compare.sweep import Sweep, points_of, run_sweep
-from mampc.report.fronts import equal_error, front_tables, write_rows
+from mampc.report.fronts import equal_error, front_figure, front_tables, write_rows
 from mampc.study import parse_study
 from mampc.study.schema import ControllerTable
 from studies import MPC_AND_PRICE, short_study
@@ -249,6 +249,14 @@ def test_names_that_look_like_markup_stand_as_they_are(swept, capsys):
         console_for_tables().print(table)
     printed = capsys.readouterr().out
     assert all(name in printed for name in ("[i]: moves", *names.values()))
+
+
+def test_the_error_that_is_marked_is_in_the_picture(swept):
+    pytest.importorskip("matplotlib")
+    _, _, rows = swept
+    for marked in (1.25, 6.0):
+        figure = front_figure(rows, rows[0]["scenario"], marked)
+        assert figure.axes[0].get_xlim()[1] > marked
 
 
 def test_a_bar_bears_any_file_name(monkeypatch, capsys):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Rows = list[dict[str, Any]]
-WIDEST = 2.5  # times the error of plain MPC, that the figure shows
+WIDEST = 2.5  # times the error of plain MPC, that the figure shows; more where a larger one is marked
 SHOWN = 1.25  # the ratio of errors that the figure marks and controllers are ranked by
 
 
@@ -79,6 +79,7 @@ def front_figure(rows: Rows, scenario: str, marked: float | None = SHOWN) -> Fig
 
     A dotted line is at the ratio of errors that is `marked`.
     """
+    widest = max(WIDEST, 1.1 * (marked or 0.0))
     baseline, points = points_of(rows, scenario)
     best = sorted(points, key=lambda name: _merit(points[name], baseline))[:2]
     look = looks(list(points), ["", *best])
@@ -93,7 +94,7 @@ def front_figure(rows: Rows, scenario: str, marked: float | None = SHOWN) -> Fig
             spread = np.array([p.moves.std(ddof=1) if len(p.moves) > 1 else 0.0 for p in own])
             spread = 100 * spread / root / base
             front = non_dominated(moves, errors)
-            least = min(least, *moves[errors <= WIDEST], 100.0)
+            least = min(least, *moves[errors <= widest], 100.0)
             panel.errorbar(
                 errors, moves, yerr=np.minimum(spread, 0.9 * moves), fmt="o", markersize=2.5, linewidth=0.6,
                 color=style.colour, zorder=style.order,
@@ -106,7 +107,7 @@ def front_figure(rows: Rows, scenario: str, marked: float | None = SHOWN) -> Fig
         if marked is not None:
             panel.axvline(marked, color="#9a9a9a", linewidth=0.7, linestyle=":")
         panel.set_yscale("log")
-        panel.set_xlim(0.9, WIDEST)
+        panel.set_xlim(0.9, widest)
         panel.set_ylim(0.6 * least, 150.0)
         panel.yaxis.set_major_formatter("{x:g}")
         panel.set_xlabel("tracking error, times that of plain MPC")
