@@ -23,7 +23,7 @@ from mampc.compare.sweep import Sweep, points_of, run_sweep
 from mampc.report.fronts import equal_error, front_figure, front_tables, write_rows
 from mampc.study import parse_study
 from mampc.study.schema import ControllerTable
-from studies import MPC_AND_PRICE, short_study
+from studies import MPC_AND_PRICE, short_study, study_of_a_model
 
 CONTROLLERS = (
     MPC_AND_PRICE
@@ -161,6 +161,18 @@ def test_results_of_another_study_are_refused(swept, tmp_path):
     (tmp_path / "sweep.jsonl").write_bytes((folder / "sweep.jsonl").read_bytes())
     with pytest.raises(mampc.MampcError, match="another sweep"):
         run_sweep(Sweep(small(steps=26), seeds=3, points=3), tmp_path)
+
+
+def test_results_of_another_model_are_refused(tmp_path):
+    text = study_of_a_model("[[scenarios]]\nname = 'one'\n" + MPC_AND_PRICE, steps=8)
+    for gain in (1.0, 1.0, 2.0):
+        lags = {"gain": gain * np.array([[1.0, 0.3], [0.2, 1.0]]), "time_constant": np.full((2, 2), 5.0)}
+        mampc.StateSpace.from_first_order(**lags, dt=1.0).save(tmp_path / "model.json")
+        again = Sweep(parse_study(text, folder=tmp_path), seeds=1, points=1)
+        if gain == 1.0:
+            run_sweep(again, tmp_path, jobs=1)
+    with pytest.raises(mampc.MampcError, match="another sweep"):
+        run_sweep(again, tmp_path, jobs=1)
 
 
 def test_a_scheduler_that_is_not_there_is_told_in_one_sentence(swept, tmp_path, monkeypatch):

@@ -40,8 +40,8 @@ class Journal:
             if not lines and "sweep" in first:
                 return False
             raise MampcError(
-                f"{shown(str(self._path), 200)}: expected results of this study, seeds and points, received those of "
-                "another sweep; give another --out, or remove the file to begin anew"
+                f"{shown(str(self._path), 200)}: expected results of this study, its files, seeds and points, received "
+                "those of another sweep; give another --out, or remove the file to begin anew"
             )
         for line in lines:
             self.done[line["task"]] = line["rows"]

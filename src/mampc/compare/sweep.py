@@ -12,16 +12,17 @@ import numpy as np
 
 from mampc.base.checks import as_jobs
 from mampc.base.errors import MampcError, shown
-from mampc.base.files import made_folder
+from mampc.base.files import made_folder, read_bounded
 from mampc.compare.fronts import Point
 from mampc.compare.journal import Journal
 from mampc.compare.knobs import variants
 from mampc.study.regulators import regulator_of
-from mampc.study.running import Prepared, prepare, run_seeds
+from mampc.study.running import Prepared, files_of, prepare, run_seeds
 from mampc.study.scenario_tables import ScenarioTable
 from mampc.study.schema import ControllerTable, Study
 
 BASELINE = ControllerTable(name="MPC", method="mpc")
+FILE_LIMIT = 2**30  # bytes
 SCHEDULER_SECONDS = 6  # that a cluster has to answer within
 
 
@@ -74,9 +75,12 @@ class Sweep:
 
     @property
     def identity(self) -> str:
-        """What tells this sweep from others."""
+        """What tells this sweep from others, the content of the study's files included."""
         text = self.study.model_dump_json(exclude={"place"})
-        return hashlib.sha256(f"{text} {self.seeds} {self.points}".encode()).hexdigest()[:16]
+        told = hashlib.sha256(f"{text} {self.seeds} {self.points}".encode())
+        for file in files_of(self.study):
+            told.update(read_bounded(file, FILE_LIMIT, "file of a study"))
+        return told.hexdigest()[:16]
 
 
 def run_sweep(
@@ -86,7 +90,6 @@ def run_sweep(
     jobs: int = -1,
     scheduler: str | None = None,
     on_task: Callable[[int, int], None] = lambda done, total: None,
-    on_stage: Callable[[str], None] = lambda stage: None,
 ) -> list[dict[str, Any]]:
     """Run what has not been run yet; every finished task is in `folder`/sweep.jsonl at once.
 
@@ -96,7 +99,6 @@ def run_sweep(
         jobs: processes, -1 for one a core.
         scheduler: address of a Dask scheduler, such as tcp://host:8786, in place of processes here.
         on_task: called with the number of finished and of all tasks.
-        on_stage: called when a stage begins.
 
     Returns:
         One row a run: scenario, controller, method, value, seed, moves, error and what `Metrics` counts.
@@ -111,10 +113,9 @@ def run_sweep(
     on_task(len(tasks) - len(missing), len(tasks))
     if missing:
         cluster = None if scheduler is None else _cluster(scheduler)
-        prepared = prepare(sweep.study, on_stage)
+        prepared = prepare(sweep.study)
         for task in {task.table.name: task for task in missing}.values():  # complain now rather than half-way
             regulator_of(sweep.study, prepared.model, task.table)
-        on_stage("running")
         for number, (name, rows) in enumerate(_results(sweep, prepared, missing, jobs, cluster), 1):
             journal.add(name, rows)
             on_task(len(tasks) - len(missing) + number, len(tasks))

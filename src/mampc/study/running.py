@@ -262,6 +262,18 @@ def _manual(study: Study, prepared: Prepared, scenario: ScenarioTable) -> Array 
     return rows
 
 
+def files_of(study: Study) -> list[Path]:
+    """The files that a study names: its model, and the records that its loads come from.
+
+    Raises:
+        StudyError: a path that leads out of its folder.
+    """
+    folder = study.place.folder
+    models = [] if study.model is None else [_inside(folder, study.model.file)]
+    loads = [load.file for scenario in study.scenarios for load in scenario.loads if load.file is not None]
+    return [*models, *(_inside(folder, file, "scenarios.loads.file") for file in loads)]
+
+
 def load_of(study: Study, model: StateSpace, table: LoadTable) -> Load:
     """The load that a table describes."""
     if table.file is None:
