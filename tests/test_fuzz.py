@@ -38,8 +38,8 @@ class Ranges:
 
         low, high = np.maximum(usual.u_min, -LARGEST / 2), np.minimum(usual.u_max, LARGEST / 2)
         self.low, self.high = np.maximum(rows("u_min", low), low), np.minimum(rows("u_max", high), high)
-        if (self.low > self.high).any():
-            self.low, self.high = np.tile(low, (n_c, 1)), np.tile(high, (n_c, 1))
+        crossing = (self.low > self.high).any(axis=0)
+        self.low, self.high = np.where(crossing, low, self.low), np.where(crossing, high, self.high)
         self.du_max = np.clip(rows("du_max", usual.du_max), 0.0, usual.du_max)[0]
 
 
