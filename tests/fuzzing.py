@@ -211,7 +211,7 @@ def loops(draw):
         if told is not None:
             settings["on_limit_violation"] = "keep_budget"
             if method == "alternating":
-                settings = {"polish": True, "on_limit_violation": "keep_budget"}
+                settings = {"polish": True, "warm_up": 0, "on_limit_violation": "keep_budget"}
         rules = mampc.MoveRules(
             **draw(move_rules(n_c)), min_size=size if size <= most and on_levels != "mixed" else 0.0, levels=told
         )  # fmt: skip
