@@ -295,7 +295,7 @@ class Believed:
             if abs(value) < 5e11 and low < value < high:
                 late, offset = self._answers[i]
                 expected = self.commands[-1 - late][i] + offset
-                tolerance = 0.01 * apart if np.isfinite(apart) else 1e-6 * max(abs(value), abs(expected))
+                tolerance = 0.01 * apart if np.isfinite(apart) else 1e-6 * abs(expected)
                 answer = self._answer(i, value, tolerance)
                 if by_hand:
                     answer = None if abs(value - self.commands[-1][i]) > 0.1 * tolerance else (0, 0.0)

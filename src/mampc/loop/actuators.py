@@ -60,7 +60,7 @@ class Actuators:
 
     def __init__(self, limits: Limits, tolerance: Array | None = None) -> None:
         apart = limits.u_max - limits.u_min
-        self._rounded = None  # share of what is reported, of inputs without a range
+        self._rounded = None  # share of what is expected, of inputs without a range
         if tolerance is None:
             ranged = np.isfinite(apart)
             tolerance = TOLERANCE * np.where(ranged, apart, 0.0)
@@ -98,7 +98,7 @@ class Actuators:
             answered = np.array(state.commands)[-1 - late.astype(np.intp), self._each]
         expected = answered + offset
         if self._rounded is not None:
-            tolerance = tolerance + self._rounded * np.maximum(np.abs(reported), np.abs(expected))
+            tolerance = tolerance + self._rounded * np.abs(expected)
         agrees = np.abs(reported - expected) <= tolerance
         stays = np.abs(reported - state.reported) <= tolerance
         careful = None if manual is None and not state.manual.any() else state.manual != 0
