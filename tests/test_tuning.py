@@ -1,5 +1,7 @@
 """Tuning by one knob: what it promises, and on which models."""
 
+import json
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -11,9 +13,10 @@ import mampc
 from builders import tank_model
 from mampc.cli import app
 from mampc.compare import candidates, promise, scenarios, tuning
+from mampc.compare.candidates import is_dear
 from mampc.compare.rounds import Rounds
 from mampc.compare.scenarios import even_weight, scenario_length
-from mampc.compare.tuned_study import study_of_model, with_tuning
+from mampc.compare.tuned_study import rules_of, study_of_model, with_tuning
 from mampc.program.usual import dead_samples, settling, usual_problem
 from mampc.study import load_study, parse_study
 from mampc.study.regulators import regulator_of
@@ -197,6 +200,54 @@ def test_where_nothing_keeps_the_allowance_plain_mpc_stays(monkeypatch):
     assert np.isfinite(decision.u).all()
 
 
+@pytest.mark.parametrize(
+    ("rules", "settings"),
+    [
+        ({"min_size": 0.5}, {}),
+        ({"dwell": 3}, {}),
+        ({"levels": 0.5}, {}),
+        ({"levels": mampc.OnOff(min_on=20.0)}, {"max_moves_per_hour": 60.0}),
+    ],
+    ids=["least size", "dwell", "step", "on or off"],
+)
+def test_rules_hold_at_the_price_found_and_errors_are_beside_the_same_rules(rules, settings, monkeypatch):
+    rules = mampc.MoveRules(**rules)
+    if is_dear(usual_problem(lag(), mampc.Limits(), 1.0), rules):
+        monkeypatch.setattr(tuning, "DEAR_ROUNDS", Rounds(2, 1, 2, 1, 2))
+        monkeypatch.setattr(candidates, "TAILS", (0.25,))
+        monkeypatch.setattr(scenarios, "LENGTHS", (30, 30))
+    found = tuned(lag(), rules=rules, **settings)
+    assert replace(found.rules, price=0.0) == rules
+    assert found.baseline.controller.rules == rules
+    assert "the rules alone" in str(found.expected)
+    run = mampc.simulate(lag(), found.regulator, mampc.steps(40, [0.0], [(3, [3.0])]), noise=found.noise)
+    changes = np.abs(np.diff(run.u[:, 0]))
+    if np.any(rules.min_size):
+        assert (changes[changes > 1e-9] >= 0.5 - 1e-9).all()
+    if rules.levels == 0.5:
+        np.testing.assert_allclose(run.u % 0.5, 0.0, atol=1e-9)
+    study = parse_study(study_text(with_tuning(study_of_model(lag(), found, "ruled"), found)))
+    assert replace(study.controllers[0].rules.made(), price=0.0) == rules
+    assert [table.method for table in study.controllers] in (["exact", "exact"], ["exact"])
+
+
+def test_rules_without_any_are_plain_mpc():
+    assert tuned(lag(), rules=mampc.MoveRules(price=3.0)).expected == tuned(lag()).expected
+
+
+def test_limits_that_exclude_the_operating_point_are_told():
+    found = tuned(lag(u_op=[5.0]), limits=mampc.Limits(u_min=6.0, u_max=16.0))
+    assert len(found.cautions) == 1
+    assert "the limits of u1, 6 to 16, exclude the model's operating point, 5" in found.cautions[0]
+    assert tuned(lag()).cautions == ()
+
+
+def test_the_price_chosen_is_on_the_front_and_in_the_rows(tank):
+    assert tank.rules.price in [point.price for point in tank.front]
+    own = [row for row in tank.rows if row["value"] == tank.rules.price]
+    assert {row["controller"] for row in own} == {tank.setting}
+
+
 def test_loads_and_reference_changes_may_be_told_where_inputs_have_no_limits():
     found = tuned(
         lag(),
@@ -224,6 +275,8 @@ def test_loads_and_reference_changes_may_be_told_where_inputs_have_no_limits():
         ({"loads": 3}, "loads"),
         ({"seed": -1}, "seed"),
         ({"baseline": "mpc"}, "baseline"),
+        ({"rules": 3}, "rules"),
+        ({"rules": mampc.MoveRules(min_size=50.0)}, "min_size"),
         ({"jobs": 0}, "--jobs: expected -1"),
     ],
 )
@@ -287,6 +340,7 @@ def test_the_command_writes_a_study_that_runs(folder, source):
     assert result.exit_code == 0, result.output
     assert "standard error" in result.output
     assert "means over 8 scenarios" in result.output
+    assert "a day" in result.output
     assert (folder / "out" / "front.png").exists()
     study = load_study(folder / "out" / "tuned.toml")
     assert study.controllers[0].rules.price > 0
@@ -294,11 +348,60 @@ def test_the_command_writes_a_study_that_runs(folder, source):
     assert 0 < run.metrics().moves.sum() < 0.5 * len(run.t)
 
 
+def test_the_page_shows_the_front_with_a_run_at_every_price(folder):
+    pytest.importorskip("plotly")
+    result = command("model.json", "--u-min", "-10", "--u-max", "10", "--out", "out")
+    assert result.exit_code == 0, result.output
+    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    content = json.loads(re.search(r'<script id="content" type="application/json">(.*?)</script>', page)[1])
+    assert [scenario["name"] for scenario in content["scenarios"]] == [
+        "random steps", "random walk", "coloured", "no load",
+    ]  # fmt: skip
+    study = load_study(folder / "out" / "tuned.toml")
+    for scenario in content["scenarios"]:
+        first, base = scenario["choices"][scenario["first"]], scenario["choices"][scenario["base"]]
+        assert base["name"] == "plain MPC"
+        assert first["name"] == f"tuned, price {study.controllers[0].rules.price:.3g}"
+        assert first["x"] < base["x"]
+        assert len(scenario["choices"]) >= 3
+        assert all(len(choice["signals"]) == 2 for choice in scenario["choices"])
+    assert "Kept: an error of at most 1.25 times that of plain MPC" in page
+
+
+RULED = """
+[[controllers]]
+name = "on or off"
+method = "exact"
+rules = { levels = [{ min_on = "30 s" }], price = 2.0 }
+"""
+
+
+def test_rules_of_a_study_are_those_of_its_actuators_or_of_the_controller_that_is_named(folder):
+    text = (
+        STUDY.replace("controllers = [", "# [").strip() + '\n[[controllers]]\nname = "MPC"\nmethod = "mpc"\n'
+    )
+    assert rules_of(parse_study(text)) is None
+    study = parse_study(text + RULED)
+    on_off = mampc.OnOff(min_on=30.0)
+    assert rules_of(study) == mampc.MoveRules(levels=(on_off,))
+    assert rules_of(study, "on or off") == mampc.MoveRules(levels=(on_off,), price=2.0)
+    two = parse_study(
+        text
+        + RULED
+        + RULED.replace("on or off", "any")
+        .replace("levels", "#")
+        .replace('rules = { # = [{ min_on = "30 s" }], price', "rules = { price")
+    )
+    with pytest.raises(mampc.MampcError, match="--controller 'on or off'"):
+        rules_of(two)
+    assert rules_of(two, "any") == mampc.MoveRules(price=2.0)
+
+
 def test_a_study_is_compared_with_its_own_mpc(folder):
     study = load_study("small.toml")
     result = command("small.toml", "--max-moves-per-hour", "40", "--out", "out")
     assert result.exit_code == 0, result.output
-    assert "at most 40 moves per hour" in result.output
+    assert "at most 40 moves of all inputs together per hour" in result.output
     tuned = load_study(folder / "out" / "tuned.toml")
     assert tuned.scenarios == study.scenarios
     assert tuned.reference == study.reference
@@ -310,8 +413,15 @@ def test_a_study_is_compared_with_its_own_mpc(folder):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["small.toml", "--max-error-increase", "25"], "share such as 25%"),
-        (["small.toml", "--max-error-increase", "much"], "share such as 25%"),
+        (["small.toml", "--max-error-increase", "25"], "here 25%"),
+        (["small.toml", "--max-error-increase", "1e9"], "such as 25%"),
+        (["small.toml", "--max-error-increase", "0"], "above 0, such as 25%"),
+        (["small.toml", "--max-error-increase", "-5%"], "above 0, such as 25%"),
+        (["small.toml", "--max-error-increase", "5"], "expected 5% or 500%"),
+        (["small.toml", "--max-error-increase", "much"], "such as 25%"),
+        (["small.toml", "--max-moves-per-hour", "-1"], "max_moves_per_hour: expected"),
+        (["small.toml", "--controller", "MPC"], "--controller: expected one with rules, among none"),
+        (["model.json", "--u-min", "0", "--u-max", "1", "--controller", "MPC"], "with a study only"),
         (["small.toml", "--max-error-increase", "5%", "--max-moves-per-hour", "3"], "one of"),
         (["model.json"], "--u-min and --u-max"),
         (["model.json", "--u-min", "low", "--u-max", "1"], "--u-min: expected numbers"),

@@ -47,7 +47,8 @@ from mampc.systems.state_space import StateSpace
 
 if TYPE_CHECKING:
     from mampc import identification, rivals
-    from mampc.compare.tuning import Tuned, tune
+    from mampc.compare.tuned import Tuned
+    from mampc.compare.tuning import tune
     from mampc.identification import (
         Export,
         Identified,
@@ -68,7 +69,8 @@ if TYPE_CHECKING:
 
 # What no controller in a loop needs is imported where it is first asked for.
 _LATER = {
-    "compare.tuning": ("Tuned", "tune"),
+    "compare.tuned": ("Tuned",),
+    "compare.tuning": ("tune",),
     "identification": (
         "Export", "IOData", "Identified", "PlannedTest", "Validation", "excite", "n4sid", "plan_test", "read_export",
         "validate",

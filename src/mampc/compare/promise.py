@@ -13,6 +13,7 @@ from mampc.base.errors import MampcError
 from mampc.compare.fronts import FEWEST, Estimate, Point
 from mampc.loop.loads import Load
 
+PLAIN, RULES_ALONE = "plain MPC", "the rules alone"  # what errors are compared with
 AIM = 0.9  # share of the allowance that the first two rounds aim at
 BACK = 0.8  # factor of the price where a confirmation fails
 FEWEST_LOOPS = 2  # of one kind of load, below which kinds are not told apart
@@ -135,6 +136,7 @@ class Expected:
         loads: the kinds of load in words.
         by_load: error ratios under each of them; empty where a kind has fewer than two scenarios.
         allowed: the error ratio asked for; None where moves per hour were.
+        beside: what errors are compared with, in words.
     """
 
     moves_per_hour: Estimate
@@ -144,6 +146,7 @@ class Expected:
     loads: tuple[str, ...] = ()
     by_load: tuple[Estimate, ...] = ()
     allowed: float | None = None
+    beside: str = PLAIN
 
     @classmethod
     def of(cls, point: Point, baseline: Point, goal: Goal, loads: Sequence[Sequence[Load]]) -> Expected:
@@ -152,7 +155,7 @@ class Expected:
         return cls(
             moves_per_hour(point, goal.hours), ratio_over_kinds(point, baseline, len(loads)),
             moves_per_hour(baseline, goal.hours), len(point.error), tuple(map(in_words, loads)),
-            by_kind(point, baseline, len(loads)), allowed,
+            by_kind(point, baseline, len(loads)), allowed, baseline.method,
         )  # fmt: skip
 
     def __str__(self) -> str:
@@ -160,9 +163,10 @@ class Expected:
         over = f"{self.scenarios} scenarios"
         kinds = list(zip(self.loads, self.by_load, strict=True)) if len(self.by_load) > 1 else []
         text = (
-            f"{_short(moves.value)} moves per hour (standard error {_short(moves.standard_error)}; plain MPC "
-            f"{_short(plain.value)}) at {error.value:.3f} times the error of plain MPC (standard error "
-            f"{error.standard_error:.2g}): means over {over}, from which a single run may differ"
+            f"{_short(moves.value)} moves per hour of all inputs together, {_short(24 * moves.value)} a day (standard "
+            f"error {_short(moves.standard_error)} per hour; {self.beside} {_short(plain.value)}), at "
+            f"{error.value:.3f} times the error of {self.beside} (standard error {error.standard_error:.2g}): means "
+            f"over {over}, from which a single run may differ"
         )
         if kinds:
             each = ", ".join(f"{name} {ratio.value:.2f}" for name, ratio in kinds)

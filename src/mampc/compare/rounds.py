@@ -22,7 +22,7 @@ class Rounds(NamedTuple):
 
 
 ROUNDS = Rounds(8, 6, 16, 11, 64)
-DEAR_ROUNDS = Rounds(4, 3, 8, 4, 12)  # where zones have loops stepped one by one
+DEAR_ROUNDS = Rounds(4, 3, 8, 4, 12)  # where loops are stepped one by one
 
 
 class Work:
@@ -38,13 +38,17 @@ class Work:
         self._bar, self._on_task = iter(watched(self.total, progress)), on_task
 
     def add(self, loops: int) -> None:
-        """So many more are done; confirmation may need more than was foreseen."""
-        for _ in range(min(loops, self.total - self.done)):
-            next(self._bar, None)
-        self.done = min(self.done + loops, self.total)
-        self._on_task(self.done, self.total)
+        """So many more are done; confirmation may need more than was foreseen, and the last counts at the end."""
+        self._tell(min(loops, self.total - 1 - self.done))
 
     def end(self) -> None:
         """All are done."""
-        self.add(self.total - self.done)
+        self._tell(self.total - self.done)
         next(self._bar, None)
+
+    def _tell(self, more: int) -> None:
+        for _ in range(more):
+            next(self._bar, None)
+        if more > 0:
+            self.done += more
+            self._on_task(self.done, self.total)

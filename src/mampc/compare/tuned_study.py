@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mampc.base.checks import LARGEST, Array
-from mampc.compare.promise import in_words
+from mampc.base.errors import MampcError, listed
+from mampc.compare.promise import PLAIN, in_words
 from mampc.compare.scenarios import CHANGE, CHANGES, STAND_IN, scenario_length
 from mampc.compare.sweep import BASELINE
-from mampc.compare.tuning import Tuned
+from mampc.compare.tuned import Tuned
 from mampc.loop.loads import Load
+from mampc.methods.registry import METHODS
+from mampc.moves.rules import MoveRules
+from mampc.program.levels import OnOff
 from mampc.study.regulators import regulator_of
 from mampc.study.running import Prepared, load_of
 from mampc.study.scenario_tables import (
@@ -29,6 +33,7 @@ from mampc.study.schema import (
     ControllerTable,
     EstimatorTable,
     ModelTable,
+    OnOffTable,
     PlantTable,
     ProblemTable,
     RulesTable,
@@ -37,9 +42,14 @@ from mampc.study.schema import (
 from mampc.systems.state_space import StateSpace
 
 MODEL_FILE = "model.json"
+OF_ACTUATORS = {
+    "min_size": True,
+    "dwell": True,
+    "levels": True,
+}  # rules that are no choice, whatever moves cost
 
 
-def told_by(study: Study, prepared: Prepared) -> dict[str, Any]:
+def told_by(study: Study, prepared: Prepared, controller: str | None = None) -> dict[str, Any]:
     """What a study tells `tune`: plain MPC with its settings, noise, set-point changes and loads of its scenarios."""
     model = prepared.model
     noise = np.max([np.broadcast_to(s.noise, model.n_outputs) for s in study.scenarios], axis=0)
@@ -51,7 +61,33 @@ def told_by(study: Study, prepared: Prepared) -> dict[str, Any]:
         "noise": noise if (noise > 0).all() else None,
         "reference_changes": np.abs(levels - rest).max(axis=0),
         "loads": loads if any(loads) else None,
+        "rules": rules_of(study, controller),
     }
+
+
+def rules_of(study: Study, controller: str | None = None) -> MoveRules | None:
+    """The rules to keep at any price: those of one controller, or what all of a study say of their actuators.
+
+    Raises:
+        MampcError: no such controller with rules, or several that say different things of the actuators.
+    """
+    tables = {table.name: table for table in study.controllers if table.method in METHODS}
+    if controller is not None:
+        if controller not in tables:
+            raise MampcError(
+                f"--controller: expected one with rules, among {listed(list(tables)) or 'none'}, received "
+                f"{controller!r}"
+            )
+        told = tables[controller].rules
+        assert told is not None
+        return told.made()
+    of_actuators = [table.rules.model_dump(include=OF_ACTUATORS) for table in tables.values() if table.rules]
+    if any(one != of_actuators[0] for one in of_actuators):
+        raise MampcError(
+            f"tune: expected controllers with the same {listed(list(OF_ACTUATORS))}, received several; say whose rules "
+            f"hold, such as --controller {next(iter(tables))!r}"
+        )
+    return RulesTable(**of_actuators[0]).made() if of_actuators else None
 
 
 def study_of_model(model: StateSpace, tuned: Tuned, name: str) -> Study:
@@ -83,16 +119,16 @@ def with_tuning(study: Study, tuned: Tuned) -> Study:
     """A study with the problem, the estimator and the controller found, and plain MPC beside it."""
     changed: dict[str, Any] = {"identification": None, "model": ModelTable(file=MODEL_FILE)}
     if tuned.is_plain:
-        return study.model_copy(update=changed | {"controllers": [BASELINE]})
+        return study.model_copy(update=changed | {"controllers": [baseline_of(tuned)]})
     estimator = EstimatorTable(
         kind="load_bank",
-        value_of_information=not tuned.problem.zoned.any(),
+        value_of_information=tuned.regulator.value_of_information,
         price_follows_noise=tuned.noise_guessed,
         measurement_noise=tuned.noise.tolist(),
     )
     controllers = [
-        ControllerTable(name="tuned", method="exact", rules=RulesTable(price=tuned.rules.price)),
-        ControllerTable(name="MPC with these weights", method="mpc"),
+        ControllerTable(name="tuned", method="exact", rules=rules_table(tuned.rules)),
+        baseline_of(tuned).model_copy(update={"name": "without a price"}),
     ]
     scenarios = [
         scenario.model_copy(update={"loads": [_found(study, load) for load in scenario.loads]})
@@ -100,6 +136,32 @@ def with_tuning(study: Study, tuned: Tuned) -> Study:
     ]
     changed |= {"problem": _problem(tuned), "estimator": estimator, "controllers": controllers}
     return study.model_copy(update=changed | {"scenarios": scenarios})
+
+
+def baseline_of(tuned: Tuned) -> ControllerTable:
+    """Plain MPC, or the rules that were told alone."""
+    if tuned.expected.beside == PLAIN:
+        return BASELINE
+    return ControllerTable(
+        name=tuned.expected.beside, method="exact", rules=rules_table(replace(tuned.rules, price=0.0))
+    )
+
+
+def rules_table(rules: MoveRules) -> RulesTable:
+    """Rules as a study says them."""
+    told: dict[str, Any] = {one.name: getattr(rules, one.name) for one in fields(rules)}
+    entries = told.pop("levels")
+    levels = [_entry(entry) for entry in entries] if isinstance(entries, tuple) else entries
+    if isinstance(entries, OnOff):
+        levels = _entry(entries)
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in told.items()}
+    return RulesTable(**{name: value for name, value in plain.items() if value is not None}, levels=levels)
+
+
+def _entry(levels: Any) -> Any:
+    if isinstance(levels, OnOff):
+        return OnOffTable(**{one.name: getattr(levels, one.name) for one in fields(levels)})
+    return "any" if levels is None else list(levels) if isinstance(levels, tuple) else levels
 
 
 def _levels(study: Study, outputs: int) -> list[list[float]]:

@@ -8,22 +8,21 @@ scenarios that nothing was chosen by.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_jobs, as_number, as_whole
+from mampc.base.checks import as_instance, as_jobs, as_whole
 from mampc.base.errors import MampcError
-from mampc.compare.candidates import Candidate, candidates
-from mampc.compare.fronts import Estimate, Point, non_dominated
-from mampc.compare.promise import Expected, Goal, moves_per_hour, ratio_over_kinds
+from mampc.compare.candidates import Candidate, candidates, is_dear
+from mampc.compare.fronts import Point, non_dominated
+from mampc.compare.promise import PLAIN, RULES_ALONE, Expected, Goal, moves_per_hour, ratio_over_kinds
 from mampc.compare.rounds import DEAR_ROUNDS, FINALISTS, HIGHER, ROUNDS, Work
 from mampc.compare.scenarios import Scenarios, Surroundings
-from mampc.controllers import MAMPC, MPC, ControllerBank
-from mampc.loop.estimator import Estimator
+from mampc.compare.tuned import REFINE_SPAN, FrontPoint, Tuned
+from mampc.controllers import MAMPC, MPC
 from mampc.loop.kalman_filter import KalmanFilter
-from mampc.loop.load_bank import LoadBank
 from mampc.loop.regulator import Regulator
 from mampc.moves.rules import MoveRules
 from mampc.program.problem import Limits, TrackingProblem
@@ -31,99 +30,7 @@ from mampc.program.usual import usual_problem
 from mampc.systems.state_space import StateSpace, as_discrete
 
 SEARCH_SPAN = (3e-3, 3.0)  # prices over the error of plain MPC in a prediction horizon
-REFINE_SPAN = 4.0  # prices up and down from where the first round led
 STEPS = (1, 2, 3, -1, -2, -3, *range(4, 16))  # it goes back where it does not, below zero up
-
-
-@dataclass(frozen=True, eq=False)
-class FrontPoint:
-    """One price of the controller chosen: means over the scenarios of the second round, with standard errors."""
-
-    price: float
-    moves_per_hour: Estimate
-    error_ratio: Estimate
-
-
-@dataclass(frozen=True, eq=False)
-class Tuned:
-    """What `tune` found.
-
-    Attributes:
-        problem: what the controller solves.
-        rules: its move rules; `rules.price` is the price chosen.
-        expected: the promise, a mean over scenarios with its standard error.
-        front: the prices of this controller that no other of them beats in moves and error, by rising error.
-        reached: whether what was asked for is kept by fewer moves than those of plain MPC.
-        baseline: plain MPC, which errors are compared with.
-        noise: of the outputs, shape (l,), as assumed or told.
-        noise_guessed: whether nobody told it; then the controller's price follows what its estimator finds of it.
-        estimator: of the controller.
-        loads: of the scenarios, which took them in turn.
-        rows: every run of the second round, as a sweep writes them.
-    """
-
-    problem: TrackingProblem
-    rules: MoveRules
-    expected: Expected
-    front: tuple[FrontPoint, ...] = field(repr=False)
-    reached: bool
-    baseline: Regulator = field(repr=False)
-    noise: Array = field(repr=False)
-    noise_guessed: bool = field(repr=False)
-    estimator: Estimator = field(repr=False)
-    loads: tuple[Any, ...] = field(repr=False)
-    rows: list[dict[str, Any]] = field(repr=False)
-
-    @property
-    def regulator(self) -> Regulator:
-        """The controller found, with its estimator."""
-        return self.at_price(self.rules.price)
-
-    def at_price(self, price: float) -> Regulator:
-        """The same with another price; 0 for none."""
-        if isinstance(self.estimator, LoadBank) and not self.is_plain:
-            return Candidate("", self.problem, self.estimator, self.noise_guessed).regulator(price)
-        return Regulator(MAMPC(self.problem, MoveRules(price=price)), self.estimator)
-
-    def bank(self, positions: int = 5, *, span: float = REFINE_SPAN) -> Regulator:
-        """An operator's slider from calm to brisk: a `ControllerBank` of prices about the one found.
-
-        Args:
-            positions: how many, an odd number; "tuned" is the middle one and decides where none is named, "calm 1",
-                "calm 2", ... move less and "brisk 1", "brisk 2", ... track better.
-            span: the calmest price over the one found, and that over the briskest.
-
-        Raises:
-            MampcError: an even number, or nothing better than plain MPC found.
-        """
-        side, span = as_whole("positions", positions, 3) // 2, as_number("span", span, 1.0, exclusive=True)
-        if positions % 2 == 0:
-            raise MampcError(
-                f"positions: expected an odd number, with the one found in the middle, received {positions}"
-            )
-        if self.is_plain:
-            raise MampcError(
-                "bank: expected a price to go up and down from, received plain MPC, which has none"
-            )
-        ways = [("calm", span), ("brisk", 1 / span)]
-        prices = {"tuned": self.rules.price} | {
-            f"{word} {k}": self.rules.price * far ** (k / side)
-            for word, far in ways
-            for k in range(1, side + 1)
-        }
-        variants = {
-            name: MAMPC(self.problem, replace(self.rules, price=price)) for name, price in prices.items()
-        }
-        counts = isinstance(self.estimator, LoadBank) and not self.problem.zoned.any()
-        return Regulator(
-            ControllerBank(variants), self.estimator, value_of_information=counts,
-            price_follows_noise=counts and self.noise_guessed,
-        )  # fmt: skip
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether nothing better than plain MPC was found."""
-        return self.problem is self.baseline.controller.problem
 
 
 def tune(
@@ -137,6 +44,7 @@ def tune(
     reference_changes: Any = None,
     loads: Any = None,
     baseline: Regulator | None = None,
+    rules: MoveRules | None = None,
     seed: int = 0,
     jobs: int = -1,
     progress: bool | None = None,
@@ -165,6 +73,8 @@ def tune(
             Default steps, a random walk, coloured noise and none in turn, sized by noise and gain.
         baseline: a regulator with plain MPC to compare with, whose horizons, weights and limits hold; default from
             the model's settling time.
+        rules: to keep at any price, such as least sizes, dwell times and levels; errors are then compared with those of
+            the same rules without a price.
         seed: equal seeds give equal results.
         jobs: processes, -1 for one a core.
         progress: as in `simulate`.
@@ -176,11 +86,12 @@ def tune(
     goal = Goal.asked(max_error_increase, max_moves_per_hour)
     as_whole("seed", seed, 0)
     as_jobs(jobs)
-    plain = _plain(model, limits, output_weight, baseline)
+    plain = _plain(model, limits, output_weight, baseline, rules)
     problem = plain.controller.problem
+    rules = MoveRules() if rules is None else replace(rules, price=0.0)
     around = Surroundings.of(problem, noise, reference_changes, loads)
-    found = candidates(problem, around.noise, around.guessed)
-    counts = DEAR_ROUNDS if problem.zoned.any() else ROUNDS
+    found = candidates(problem, around.noise, around.guessed, rules)
+    counts = DEAR_ROUNDS if is_dear(problem, rules) else ROUNDS
     work = Work(counts, len(found), progress, on_task)
     first, base = _drawn(plain, around, counts.searched, (seed, 1), work)
     goal = replace(goal, hours=first.hours, kinds=len(around.loads))
@@ -198,41 +109,54 @@ def tune(
     for (candidate, _), points in zip(tasks, _each(tasks, second, jobs, work), strict=True):
         finalists.append((*goal.at_aim(points, base), candidate, points))
     finalists.sort(key=lambda finalist: finalist[0])
-    rows = rows_of(
-        [base, *(point for *_, points in finalists for point in points)], base.method, second.hours
-    )
     last, last_base = _drawn(plain, around, counts.confirmed, (seed, 3), work)
     chosen, price, point, reached = _confirmed(goal, finalists, last, last_base, jobs, work)
-    work.end()
     expected = Expected.of(point, last_base, goal, around.loads)
     front: tuple[FrontPoint, ...] = ()
+    runs = [base, *(point for *_, points in finalists for point in points)]
     if chosen is not None:
         own = next(points for *_, candidate, points in finalists if candidate is chosen)
-        front = _front(own, base, goal)
+        at_price = _at_price(chosen, price, second, jobs)  # beside the others, in the same scenarios
+        front = _front([*own, at_price], base, goal)
+        runs.append(at_price)
+    work.end()
+    rows = rows_of(runs, base.method, second.hours)
     return Tuned(
-        problem if chosen is None else chosen.problem, MoveRules(price=price), expected, front, reached, plain,
+        problem if chosen is None else chosen.problem, replace(rules, price=price), expected, front, reached, plain,
         around.noise, chosen is not None and chosen.guessed, plain.estimator if chosen is None else chosen.estimator,
-        around.loads, rows,
+        around.loads, rows, base.method if chosen is None else chosen.name, _cautions(problem),
     )  # fmt: skip
 
 
 def _plain(
-    model: StateSpace, limits: Limits | None, output_weight: Any, baseline: Regulator | None
+    model: StateSpace,
+    limits: Limits | None,
+    output_weight: Any,
+    baseline: Regulator | None,
+    rules: MoveRules | None,
 ) -> Regulator:
-    """Plain MPC to compare with."""
+    """Plain MPC to compare with, or what keeps the rules and has no price."""
     as_discrete("model", model)
     if baseline is None:
         if limits is None:
             raise MampcError("limits: expected mampc.Limits with u_min and u_max, received none")
         problem = usual_problem(model, limits, output_weight)
-        return Regulator(MPC(problem), KalmanFilter.offset_free(model))
+        return _under(rules, Regulator(MPC(problem), KalmanFilter.offset_free(model)))
     if not isinstance(baseline, Regulator) or type(baseline.controller) is not MPC:
         raise MampcError(f"baseline: expected a mampc.Regulator with plain MPC, received {baseline!r}")
     if baseline.controller.problem.model is not model:
         raise MampcError("baseline: expected a regulator of the same model, received one of another")
     if limits is not None:
         raise MampcError("limits: expected those of the baseline, received others beside it")
-    return baseline
+    return _under(rules, baseline)
+
+
+def _under(rules: MoveRules | None, plain: Regulator) -> Regulator:
+    if rules is None:
+        return plain
+    rules = replace(as_instance("rules", rules, MoveRules), price=0.0)
+    controller = MAMPC(plain.controller.problem, rules)
+    return plain if controller.is_plain else Regulator(controller, plain.estimator)
 
 
 def _drawn(
@@ -240,11 +164,11 @@ def _drawn(
 ) -> tuple[Scenarios, Point]:
     """Scenarios, and plain MPC in them."""
     scenarios = Scenarios.drawn(plain, around, count, seed)
-    base = Point("plain MPC", 0.0, *scenarios.run(plain))
+    base = Point(PLAIN if type(plain.controller) is MPC else RULES_ALONE, 0.0, *scenarios.run(plain))
     if not np.isfinite(base.error).all() or not base.error.mean() > 0:
         raise MampcError(
-            "tune: expected a model that plain MPC with these horizons, weights and limits controls, received one on "
-            "which it runs away; give a baseline that works"
+            f"tune: expected a model that {base.method} with these horizons, weights and limits can control, received "
+            "one on which it runs away; give a baseline that works"
         )
     work.add(count)
     return scenarios, base
@@ -257,7 +181,7 @@ def _each(
 
     Prices of one candidate are run together where that makes them cheaper, else apart.
     """
-    apart = 1 if tasks[0][0].problem.zoned.any() else len(tasks[0][1])
+    apart = 1 if tasks[0][0].dear else len(tasks[0][1])
     parts = [
         (candidate, prices[k : k + apart])
         for candidate, prices in tasks
@@ -307,7 +231,7 @@ def _confirmed(
 
 def _at_price(candidate: Candidate, price: float, scenarios: Scenarios, jobs: int) -> Point:
     """The runs of one price; in parallel where each is dear."""
-    if jobs == 1 or not candidate.problem.zoned.any():
+    if jobs == 1 or not candidate.dear:
         return candidate.points([price], scenarios)[0]
     from joblib import Parallel, delayed
 
@@ -345,11 +269,27 @@ def _nearest(
 
 
 def _front(points: Sequence[Point], base: Point, goal: Goal) -> tuple[FrontPoint, ...]:
+    """Those that no other beats, and the last one, by rising error."""
     ratios = [ratio_over_kinds(point, base, goal.kinds) for point in points]
     moves, errors = np.array([p.moves.mean() for p in points]), np.array([r.value for r in ratios])
+    kept = sorted(
+        {*non_dominated(moves, errors).tolist(), len(points) - 1}, key=lambda i: (errors[i], -moves[i])
+    )
+    return tuple(FrontPoint(points[i].value, moves_per_hour(points[i], goal.hours), ratios[i]) for i in kept)
+
+
+def _cautions(problem: TrackingProblem) -> tuple[str, ...]:
+    """Limits that exclude the operating point: scenarios rest elsewhere."""
+    model, limits = problem.model, problem.limits
+    outside = (model.u_op < limits.u_min) | (model.u_op > limits.u_max)
     return tuple(
-        FrontPoint(points[i].value, moves_per_hour(points[i], goal.hours), ratios[i])
-        for i in non_dominated(moves, errors).tolist()
+        f"the limits of {name}, {low:.5g} to {high:.5g}, exclude the model's operating point, {at:.5g}: scenarios rest "
+        "at the nearest limit instead, from which this input can move one way only; put in limits of the actuator, in "
+        "the model's units and not as deviations, or use a model of where the plant is run"
+        for name, low, high, at, out in zip(
+            model.names.inputs, limits.u_min, limits.u_max, model.u_op, outside, strict=True
+        )
+        if out
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,10 +74,19 @@ def _shown(estimate: Estimate) -> str:
     return f"{100 * estimate.value:.1f}{error}"
 
 
-def front_figure(rows: Rows, scenario: str, marked: float | None = SHOWN) -> Figure:
+def front_figure(
+    rows: Rows,
+    scenario: str,
+    marked: float | None = SHOWN,
+    *,
+    ratio: Callable[[Point, Point], float] = error_ratio,
+    beside: str = "plain MPC",
+    widest: float = WIDEST,
+) -> Figure:
     """Moves against error of every controller, both over plain MPC's; bars are standard errors over the seeds.
 
-    A dotted line is at the ratio of errors that is `marked`.
+    A dotted line is at the ratio of errors that is `marked`; `ratio` makes them of runs, `beside` names what they are
+    compared with, and `widest` is the largest ratio drawn.
     """
     widest = max(WIDEST, 1.1 * (marked or 0.0))
     baseline, points = points_of(rows, scenario)
@@ -89,7 +98,7 @@ def front_figure(rows: Rows, scenario: str, marked: float | None = SHOWN) -> Fig
         least = 100.0
         for name, own in points.items():
             style = look[name]
-            errors = np.array([error_ratio(p, baseline) for p in own])
+            errors = np.array([ratio(p, baseline) for p in own])
             moves = 100 * np.array([max(p.moves.mean(), FEWEST) for p in own]) / base
             spread = np.array([p.moves.std(ddof=1) if len(p.moves) > 1 else 0.0 for p in own])
             spread = 100 * spread / root / base
@@ -103,15 +112,15 @@ def front_figure(rows: Rows, scenario: str, marked: float | None = SHOWN) -> Fig
                 errors[front], moves[front], style.dashes, color=style.colour, linewidth=style.width,
                 zorder=style.order, label=plain(name),
             )  # fmt: skip
-        panel.plot([1.0], [100.0], "ks", markersize=4, zorder=6, label="plain MPC")
+        panel.plot([1.0], [100.0], "ks", markersize=4, zorder=6, label=beside)
         if marked is not None:
             panel.axvline(marked, color="#9a9a9a", linewidth=0.7, linestyle=":")
         panel.set_yscale("log")
         panel.set_xlim(0.9, widest)
         panel.set_ylim(0.6 * least, 150.0)
         panel.yaxis.set_major_formatter("{x:g}")
-        panel.set_xlabel("tracking error, times that of plain MPC")
-        panel.set_ylabel("input changes, percent of plain MPC's")
+        panel.set_xlabel(f"tracking error, times that of {beside}")
+        panel.set_ylabel(f"input changes, percent of those of {beside}")
         legend_above(figure)
     return figure
 
