@@ -19,7 +19,7 @@ import mampc
 from attention import BASELINE, EVALUATION, RATIO, measured, regulators_of
 from attention_cases import Case, cases, load_of, reference_of
 from mampc.compare.fronts import moves_at
-from mampc.loop.learnt_gains import with_gains
+from mampc.loop.corrected_gains import with_gains
 from measuring import options
 
 OFF = 0.2

@@ -8,7 +8,7 @@ import pytest
 import mampc
 from builders import random_model
 from mampc import loads
-from mampc.loop.learnt_gains import MOST, with_gains
+from mampc.loop.corrected_gains import MOST, with_gains
 from seeds import seeds
 
 NOISE = np.array([0.05, 0.1])

@@ -65,6 +65,10 @@ class Remark(Sentence):
         "rules_suspended",
         "The move rules were suspended: under them an output would leave its limits by more than the margin.",
     )
+    GAINS_CORRECTED = (
+        "gains_corrected",
+        "The gains of the model were corrected, since these predict better: from the next sample on they decide.",
+    )
 
 
 class Fault(Sentence):

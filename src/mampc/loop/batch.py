@@ -237,7 +237,7 @@ class BatchMetrics(tuple[Metrics, ...]):
 
 def _steps_like(own: Regulator, other: Regulator) -> bool:
     """Whether a regulator estimates as arrays can, and as another one."""
-    if type(own) is not Regulator or type(own.estimator) not in (KalmanFilter, LoadBank):
+    if type(own) is not Regulator or type(own.estimator) not in (KalmanFilter, LoadBank) or own.learns_gains:
         return False
     return own is other or (
         own.estimator is other.estimator

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.errors import MampcError
+from mampc.controllers.bank import ControllerBank
 from mampc.controllers.controller import Controller
 from mampc.controllers.mampc import MAMPC
 from mampc.controllers.offset import FEW
@@ -75,3 +76,23 @@ def _knows_what_they_tell(controller: MAMPC) -> bool:
         and rules.levels is None
         and not controller.problem.zoned.any()
     )
+
+
+def with_information(planner: Controller, estimator: Estimator, price_follows_noise: bool) -> Controller:
+    """The controller with plans that count on later data.
+
+    Raises:
+        MampcError: another controller than `MAMPC`, or an estimator that does not know its noise in output units.
+    """
+    if type(planner) not in (MAMPC, ControllerBank) or not any(type(one) is MAMPC for one in planner.each):
+        raise MampcError(
+            f"value_of_information: expected a controller MAMPC, or a bank of them, received {type(planner).__name__}"
+        )
+    assert isinstance(planner, MAMPC | ControllerBank)
+    shifts = estimator.shifts(planner.problem.control_horizon - 1)
+    if shifts is None:
+        raise MampcError(
+            "value_of_information: expected an estimator that knows the noise in output units, such as a LoadBank, "
+            f"received {type(estimator).__name__}"
+        )
+    return planner.with_information(shifts, price_follows_noise=price_follows_noise)

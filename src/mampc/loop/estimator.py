@@ -53,10 +53,12 @@ class Estimator(ABC):
         model: the discrete model of the plant.
         noise: standard deviation of the measurement noise of each output, shape (l,), in output units; None where only
             ratios count.
+        noise_told: the same where it was told, or the model's record did; None where it is a guess or not known.
     """
 
     model: StateSpace
     noise: Array | None = None
+    noise_told: Array | None = None
 
     @property
     def planning_model(self) -> StateSpace:

@@ -47,6 +47,7 @@ class KalmanFilter(Estimator):
     Attributes:
         A, C: of the model with the disturbances as further states.
         gain: from innovation to these, with every output believed.
+        settings: what `offset_free` was told; None for filters made otherwise.
     """
 
     def __init__(self, model: StateSpace, directions: Directions, covariance: Array, noise: Array) -> None:
@@ -56,6 +57,7 @@ class KalmanFilter(Estimator):
         self._gains: dict[bytes, Array] = {}
         self.gain = self.gain_with(np.ones(model.n_outputs, dtype=bool))
         self.map, self._parts = self._everyday()
+        self.settings: dict[str, Any] | None = None
 
     def __repr__(self) -> str:
         at_inputs = int(self.directions.at_inputs.any(axis=0).sum())
@@ -132,7 +134,14 @@ class KalmanFilter(Estimator):
             P = units * covariance(*scaled)
         except MampcError as error:
             raise MampcError(f"offset_free: {error}") from None
-        return cls(model, directions, P, R)
+        made = cls(model, directions, P, R)
+        if measurement_noise is not None or white_noise(model.noise) is not None:
+            made.noise_told = noise
+        made.settings = {
+            "disturbance": disturbance, "measurement_noise": measurement_noise, "drift": drift,
+            "input_noise": input_noise, "unseen": unseen,
+        }  # fmt: skip
+        return made
 
     def gain_with(self, believed: BoolArray) -> Array:
         """From innovation to state and disturbances, shape (n + l, l), where only some outputs count.

@@ -87,7 +87,8 @@ class LoadBank(Estimator):
                 "give it, or let LoadBank.for_problem guess"
             )
         sizes = as_vector("noise", noise, model.n_outputs, 0.0, exclusive=True)
-        self._told = NOISE_GUESSED if as_flag("guessed", guessed) else NOISE_TOLD
+        self.guessed = as_flag("guessed", guessed)
+        self._told, self.noise_told = (NOISE_GUESSED, None) if self.guessed else (NOISE_TOLD, sizes)
         self.model, self.noise, self.hypotheses = model, sizes, tuple(hypotheses)
         self.loads = Loads.of(model, sizes)
         try:
@@ -198,11 +199,14 @@ class LoadBank(Estimator):
         members = bank.members.copy()
         members[:, n : n + k] = loads[int(stuck.argmax()), :k]
         members[:, n + k :] = 0.0
-        plain = self.plain.with_loads(self._plain_of(bank), stuck, loads[:, k:]).flat
+        return self.with_parts(bank, members, self.plain.with_loads(self.plain_of(bank), stuck, loads[:, k:]))
+
+    def with_parts(self, bank: BankEstimate, members: Array, plain: Estimate) -> BankEstimate:
+        """The estimate with other z of each hypothesis, shape (B, n + 2k), and another one of the plain filter."""
         counts = self._counts(bank.weights, bank.late, bank.scale)
         hindsight = bank.missed, bank.foretold.copy(), bank.sums
         return self._estimate(
-            members, bank.weights, bank.usual, bank.scale, bank.late, plain, counts, hindsight
+            members, bank.weights, bank.usual, bank.scale, bank.late, plain.flat, counts, hindsight
         )
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
@@ -286,7 +290,7 @@ class LoadBank(Estimator):
         members = np.matmul(self._A, mixed[:, :, None])[:, :, 0]
         members[:, : model.n_states] += model.B @ self._change(u, v)
         late = self._of_late.dot(np.concatenate((bank.late, u)))
-        plain = self.plain.predict(self._plain_of(bank), u, v).flat
+        plain = self.plain.predict(self.plain_of(bank), u, v).flat
         counts, l = self._counts(c, late, bank.scale), model.n_outputs
         missed = self._hindsight.misses.dot(np.concatenate((bank.missed, self._nothing)))
         hindsight = missed, np.concatenate((self._nothing, bank.foretold[:-l])), bank.sums
@@ -295,7 +299,7 @@ class LoadBank(Estimator):
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
         """Measured less predicted outputs of the mixture, shape (l,); see `KalmanFilter.innovation`."""
         bank, model = bank_estimate(predicted), self.model
-        expected = model.y_op + bank.weights @ self._seen(bank.members) + model.D @ self._change(u, v)
+        expected = model.y_op + bank.weights @ self.seen(bank.members) + model.D @ self._change(u, v)
         return np.asarray(y - expected)
 
     def corrected(
@@ -303,10 +307,10 @@ class LoadBank(Estimator):
     ) -> BankEstimate:
         """Correct with the innovation (l,) of the mixture, of which only the outputs `believed` count."""
         bank, believed = bank_estimate(predicted), self._all if believed is None else believed
-        seen, filters = self._seen(bank.members), self.filters(believed)
+        seen, filters = self.seen(bank.members), self.filters(believed)
         innovation = np.where(believed, innovation, 0.0)
         each = innovation + bank.weights @ seen - seen
-        plain, model = self._plain_of(bank), self.model
+        plain, model = self.plain_of(bank), self.model
         seen_beside = bank.weights @ seen + self.plain.innovation(plain, model.u_op, model.y_op)
         off = np.where(believed, innovation + seen_beside, 0.0)
         corrected = self.plain.corrected(plain, off, believed).flat
@@ -381,11 +385,12 @@ class LoadBank(Estimator):
             members, weights, usual, scale, late, plain, missed, foretold, sums,
         )  # fmt: skip
 
-    def _plain_of(self, bank: BankEstimate) -> Estimate:
+    def plain_of(self, bank: BankEstimate) -> Estimate:
+        """What the plain filter estimates."""
         n, l = self.model.n_states, self.model.n_outputs
         return Estimate(bank.plain[:n], bank.plain[n : n + l], bank.plain[n + l :])
 
-    def _seen(self, members: Array) -> Array:
+    def seen(self, members: Array) -> Array:
         """The outputs of every hypothesis beside those of the inputs, shape (B, l)."""
         return np.asarray(np.matmul(self._C, members[:, :, None])[:, :, 0])
 

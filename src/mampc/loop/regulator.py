@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from copy import copy
+from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,16 +24,18 @@ from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.controllers.mampc import MAMPC
 from mampc.controllers.offset import offset_of
-from mampc.loop.actuators import LATEST, Actuators
-from mampc.loop.defaults import counts_on_later_data, default_estimator
+from mampc.loop.actuators import Actuators
+from mampc.loop.defaults import counts_on_later_data, default_estimator, with_information
 from mampc.loop.estimator import Estimate, Estimator
 from mampc.loop.reference_filter import ReferenceFilter
 from mampc.loop.sensors import Judged, SensorChecks, SensorState
-from mampc.loop.state import RegulatorState
-from mampc.loop.valves import Compensation, Valves
-from mampc.program.daqp import active_flags
+from mampc.loop.state import RegulatorState, fitting_state
+from mampc.loop.valves import Valves, compensation_of
 from mampc.program.problem import Limits
 from mampc.systems.state_space import StateSpace
+
+if TYPE_CHECKING:
+    from mampc.loop.online_gains import Gains, OnlineGains
 
 USUAL_CHECKS = SensorChecks()
 
@@ -61,9 +65,11 @@ class Regulator:
             decided that bring them there: a reversal is larger by `band - jump`. `u_applied` are positions, and so are
             plan and changes of decisions. Moves of less than `jump` are not executed, so that rules have at least that
             for `min_size`, and some more.
+        learn_gains: correct the gains of the model while the loop runs, where that predicts better (see
+            docs/models.md). Needs an estimator that was told the noise. States of the model belong to one input each then.
 
     Raises:
-        MampcError: arguments of other types, or an estimator of a model of other dimensions.
+        MampcError: arguments of other types, an estimator of a model of other dimensions, gains that cannot be learnt.
     """
 
     def __init__(
@@ -78,6 +84,7 @@ class Regulator:
         applied_tolerance: Any = None,
         reference_filter: ReferenceFilter | None = None,
         valves: Valves | None = None,
+        learn_gains: bool = False,
     ) -> None:
         if not isinstance(controller, Controller):
             raise MampcError(f"controller: expected MPC or MAMPC, received {type(controller).__name__}")
@@ -85,11 +92,19 @@ class Regulator:
             raise MampcError(
                 f"estimator: expected a KalmanFilter or a LoadBank, received {type(estimator).__name__}"
             )
+        estimator = default_estimator(controller) if estimator is None else estimator
         model = controller.problem.model
-        self.controller = controller
+        expected, received = _sizes(model), _sizes(estimator.model)
+        if received != expected:
+            raise MampcError(f"estimator: expected a model with {expected}, received {received}")
+        if as_flag("learn_gains", learn_gains):
+            from mampc.loop.online_gains import OnlineGains, made_to_learn
+
+            controller, estimator = made_to_learn(controller, estimator)
+            model = controller.problem.model
+        self.controller, self.estimator = controller, estimator
         self.max_blind_steps = as_whole("max_blind_steps", max_blind_steps, 0)
         self._y_shape, self._u_shape = (model.n_outputs,), (model.n_inputs,)
-        self.estimator = default_estimator(controller) if estimator is None else estimator
         self.sensors = as_instance("sensors", USUAL_CHECKS if sensors is None else sensors, SensorChecks)
         self._sensors = self.sensors.fitted(controller.problem, self.estimator.noise)
         self._v_shape = (model.n_disturbances,)
@@ -97,9 +112,6 @@ class Regulator:
         if applied_tolerance is not None:
             tolerance = as_vector("applied_tolerance", applied_tolerance, model.n_inputs, 0.0)
         self._actuators = Actuators(controller.problem.limits, tolerance)
-        expected, received = _sizes(model), _sizes(self.estimator.model)
-        if received != expected:
-            raise MampcError(f"estimator: expected a model with {expected}, received {received}")
         self.reference_filter, self._filter = reference_filter, None
         if reference_filter is not None:
             smooth = as_instance("reference_filter", reference_filter, ReferenceFilter)
@@ -107,7 +119,7 @@ class Regulator:
         self._samples = controller.problem.prediction_horizon + 1
         self.valves, self._compensation = valves, None
         if valves is not None:
-            self._compensation = _compensation(valves, controller)
+            self._compensation = compensation_of(valves, controller)
         # What plans predict with may have more states than the plant.
         self._planner = controller
         if self.estimator.planning_model is not self.estimator.model:
@@ -119,14 +131,23 @@ class Regulator:
         if self.price_follows_noise and not self.value_of_information:
             raise MampcError("price_follows_noise: expected value_of_information=True beside it")
         if self.value_of_information:
-            self._planner = _with_information(self._planner, self.estimator, self.price_follows_noise)
+            self._planner = with_information(self._planner, self.estimator, self.price_follows_noise)
         self._counts_on_data = any(
             isinstance(one, MAMPC) and one.information is not None for one in self._planner.each
         )
+        self._online: OnlineGains | None = None
+        if learn_gains:
+            own = partial(
+                Regulator, sensors=sensors, max_blind_steps=max_blind_steps, applied_tolerance=applied_tolerance,
+                value_of_information=self.value_of_information, price_follows_noise=price_follows_noise,
+                reference_filter=reference_filter, valves=valves,
+            )  # fmt: skip
+            self._online = OnlineGains(copy(self), own)
 
     def __repr__(self) -> str:
         counts = ", value_of_information=True" if self.value_of_information else ""
-        return f"Regulator({type(self.controller).__name__}, {self.estimator!r}{counts})"
+        learns = ", learn_gains=True" if self.learns_gains else ""
+        return f"Regulator({type(self.controller).__name__}, {self.estimator!r}{counts}{learns})"
 
     def largest_offset(self, state: RegulatorState | None = None) -> Array:
         """The largest offset of each output, shape (l,), that can stay for good, in output units.
@@ -139,8 +160,22 @@ class Regulator:
                 as told.
         """
         weights = None if state is None else self.estimator.weights_of(state.estimate)
-        largest: Array = np.max([offset_of(one, weights) for one in self._planner.each], axis=0)
+        planner = self._planner
+        if self._online is not None and state is not None and state.learnt is not None:
+            planner = self._online.regulator(state.learnt.factors)._planner
+        largest: Array = np.max([offset_of(one, weights) for one in planner.each], axis=0)
         return largest
+
+    @property
+    def learns_gains(self) -> bool:
+        """Whether gains of the model are corrected while the loop runs."""
+        return self._online is not None
+
+    def gains(self, state: RegulatorState) -> Gains:
+        """What is learnt of the gains, and which are in force; raises `MampcError` where none are learnt."""
+        if self._online is None or state.learnt is None:
+            raise MampcError("gains: expected a regulator with learn_gains=True and a state of it")
+        return self._online.gains(state.learnt)
 
     def initial_state(
         self, u_previous: Any = None, y: Any = None, measured_disturbance: Any = None
@@ -167,45 +202,21 @@ class Regulator:
         if self._filter is not None:
             tracked = self._outputs(estimate, controller.inputs[-1], v) if y is None else as_vector("y", y, l)
         command = None if self._compensation is None else controller.inputs[-1]
-        return RegulatorState(controller, estimate, v, sensors, actuators, tracked, command)
+        learnt = (
+            None if self._online is None else self._online.initial(np.concatenate((controller.inputs[-1], v)))
+        )
+        return RegulatorState(controller, estimate, v, sensors, actuators, tracked, command, learnt)
 
     def state_from_json(self, text: str) -> RegulatorState:
         """The state that `RegulatorState.to_json` wrote; raises `MampcError` for anything that does not fit."""
-        state, problem = RegulatorState.from_json(text), self.controller.problem
-        expected = self.initial_state().shapes() | {
+        problem = self.controller.problem
+        fits = {
             "controller.guess": (problem.control_horizon, problem.model.n_inputs),
             "controller.active": (self.controller.condensed.bounds.size,),
         }
-        if type(state.estimate) is not type(self.initial_state().estimate):
-            raise MampcError(
-                f"state: expected an estimate of {type(self.estimator).__name__}, received another estimator's"
-            )
-        for place, shape in state.shapes().items():
-            if place == "controller.memory":  # what a rule around a controller keeps; it knows what fits
-                continue
-            may_be_none = place in ("controller.guess", "controller.active")
-            zone = place == "reference" and expected[place] is not None and shape == (2, *self._y_shape)
-            if shape != expected[place] and not (may_be_none and shape is None) and not zone:
-                raise MampcError(f"state: expected {place} of shape {expected[place]}, received {shape}")
-        for name in ("weights", "usual"):
-            shares = getattr(state.estimate, name, np.ones(1))
-            if (shares < 0).any() or not abs(shares.sum() - 1) < 1e-9:
-                raise MampcError(f"state: expected estimate.{name} that sum up to 1, received {shares}")
-        scale = getattr(state.estimate, "scale", np.ones(1))
-        if not (scale > 0).all():
-            raise MampcError(f"state: expected positive numbers at estimate.scale, received {scale}")
-        squares = getattr(state.estimate, "sums", np.zeros(2))[1]
-        if squares < 0:
-            raise MampcError(f"state: expected a sum of squares at estimate.sums, received {squares}")
-        if not active_flags(state.controller.active):
-            raise MampcError(
-                f"state: expected flags at controller.active, received {state.controller.active}"
-            )
-        late = state.actuators.late
-        if not np.isin(late, np.arange(LATEST + 1)).all():
-            raise MampcError(
-                f"state: expected whole numbers up to {LATEST} at actuators.late, received {late}"
-            )
+        state = fitting_state(text, self.initial_state(), fits)
+        if self._online is not None and state.learnt is not None:
+            self._online.regulator(state.learnt.factors)
         return state
 
     def step(
@@ -247,6 +258,15 @@ class Regulator:
         if not isinstance(state, RegulatorState):
             raise MampcError(f"state: expected a RegulatorState, received {type(state).__name__}")
         y = as_shaped("y", y, self._y_shape)
+        if (state.learnt is None) is not (self._online is None):
+            kind = "does not learn" if self._online is None else "learns"
+            raise MampcError(f"state: expected one of a regulator that {kind} gains, received another's")
+        if self._online is not None:
+            decision = self._online.step(
+                state, y, reference, u_applied=u_applied, measured_disturbance=measured_disturbance,
+                limits=limits, manual=manual, variant=variant,
+            )  # fmt: skip
+            return decision._replace(solve_time=perf_counter() - start)
         memory, actuators, v_last = state.controller, state.actuators, state.measured_disturbance
         in_manual = self.controller.manual_inputs(manual)
         if u_applied is not None:
@@ -311,6 +331,16 @@ class Regulator:
             solve_time=perf_counter() - start,
         )
 
+    def inputs_since(self, state: RegulatorState, u_applied: Any, manual: Any) -> Array:
+        """Inputs that count as applied since a state, shape (m,), for those reported as `step` takes them."""
+        inputs = state.controller.inputs
+        if u_applied is not None:
+            reported = as_shaped("u_applied", u_applied, self._u_shape)
+            by_hand = self.controller.manual_inputs(manual)
+            inputs, _ = self._actuators.update(state.actuators, inputs, reported, by_hand)
+        applied: Array = inputs[-1]
+        return applied
+
     def _outputs(self, estimate: Estimate, u: Array, v: Array) -> Array:
         """The outputs estimated, shape (l,)."""
         return -self.estimator.innovation(estimate, u, np.zeros(self._y_shape), v)
@@ -348,43 +378,6 @@ class Regulator:
         if judged.believed.any():
             estimate = estimator.corrected(estimate, innovation, judged.believed)
         return estimate, judged, sensors
-
-
-def _compensation(valves: Valves, controller: Controller) -> Compensation:
-    """That of a controller's valves; raises `MampcError` where its moves are not executed."""
-    compensation = Compensation(as_instance("valves", valves, Valves), controller.problem.model.n_inputs)
-    for one in controller.each:
-        if type(one) is not MAMPC or one.levels is not None:
-            raise MampcError(
-                f"valves: expected a MAMPC of inputs without levels, or a bank of them, received {type(one).__name__}"
-            )
-        size = as_vector("min_size", one.rules.min_size, controller.problem.model.n_inputs)
-        if ((size <= compensation.jump) & (compensation.jump > 0)).any():
-            raise MampcError(
-                f"valves: expected rules with a min_size above the jump of {compensation.jump}, since smaller moves "
-                f"are not executed, received {size}"
-            )
-    return compensation
-
-
-def _with_information(planner: Controller, estimator: Estimator, price_follows_noise: bool) -> Controller:
-    """The controller with plans that count on later data.
-
-    Raises:
-        MampcError: another controller than `MAMPC`, or an estimator that does not know its noise in output units.
-    """
-    if type(planner) not in (MAMPC, ControllerBank) or not any(type(one) is MAMPC for one in planner.each):
-        raise MampcError(
-            f"value_of_information: expected a controller MAMPC, or a bank of them, received {type(planner).__name__}"
-        )
-    assert isinstance(planner, MAMPC | ControllerBank)
-    shifts = estimator.shifts(planner.problem.control_horizon - 1)
-    if shifts is None:
-        raise MampcError(
-            "value_of_information: expected an estimator that knows the noise in output units, such as a LoadBank, "
-            f"received {type(estimator).__name__}"
-        )
-    return planner.with_information(shifts, price_follows_noise=price_follows_noise)
 
 
 def _where_usable(reported: Array, otherwise: Array) -> Array:

@@ -11,10 +11,13 @@ from mampc.base.checks import Array, as_whole
 from mampc.base.errors import MampcError, shown
 from mampc.base.identity import equal_only_to_itself
 from mampc.controllers.decision import ControllerState
-from mampc.loop.actuators import ActuatorState
+from mampc.loop.actuators import LATEST, ActuatorState
+from mampc.loop.corrected_gains import MOST
 from mampc.loop.estimator import Estimate
+from mampc.loop.gain_learner import Learnt
 from mampc.loop.mixing import BankEstimate
 from mampc.loop.sensors import SensorState
+from mampc.program.daqp import active_flags
 
 FORMAT = "mampc-regulator-state-1"
 
@@ -33,6 +36,7 @@ class RegulatorState(NamedTuple):
             is asked for; else None.
         command: inputs decided last, shape (m,), where valves are compensated, whose positions the controller has in
             place of them; else None.
+        learnt: of the gains of the model, where the regulator learns them; else None.
     """
 
     controller: ControllerState
@@ -42,6 +46,7 @@ class RegulatorState(NamedTuple):
     actuators: ActuatorState
     reference: Array | None = None
     command: Array | None = None
+    learnt: Learnt | None = None
 
     def to_json(self) -> str:
         """The state as JSON text; `Regulator.state_from_json` gives the same numbers back."""
@@ -52,6 +57,7 @@ class RegulatorState(NamedTuple):
         return {
             "controller": self.controller._asdict(), "estimate": vars(self.estimate),
             "sensors": self.sensors._asdict(), "actuators": self.actuators._asdict(),
+            **({} if self.learnt is None else {"learnt": self.learnt._asdict()}),
         }  # fmt: skip
 
     @classmethod
@@ -64,11 +70,13 @@ class RegulatorState(NamedTuple):
             numbers = {part: _numbers(part, values) for part, values in content.items()}
             actuators, sensors, estimate = (numbers.pop(p) for p in ("actuators", "sensors", "estimate"))
             kind = BankEstimate if "weights" in estimate else Estimate
+            learnt = numbers.pop("learnt", None)
             return cls(
                 ControllerState(**numbers.pop("controller")),
                 kind(**estimate),
                 sensors=SensorState(**sensors),
                 actuators=ActuatorState(tuple(actuators.pop("commands")), **actuators),
+                learnt=None if learnt is None else Learnt(**learnt),
                 **numbers,
             )
         except MampcError:
@@ -100,3 +108,53 @@ def _numbers(place: str, value: Any) -> Any:
     if not np.isfinite(array).all():
         raise MampcError(f"state: expected finite numbers at {place}, received {value}")
     return array
+
+
+def fitting_state(text: str, usual: RegulatorState, further: dict[str, tuple[int, ...]]) -> RegulatorState:
+    """The state that `RegulatorState.to_json` wrote, as one of the regulator of another state.
+
+    Args:
+        text: JSON.
+        usual: what is expected, by the shapes of its arrays.
+        further: shapes of what there may be besides, by place.
+
+    Raises:
+        MampcError: anything that does not fit.
+    """
+    state, expected = RegulatorState.from_json(text), usual.shapes() | further
+    if type(state.estimate) is not type(usual.estimate):
+        raise MampcError(
+            f"state: expected a {type(usual.estimate).__name__}, received another estimator's estimate"
+        )
+    if (state.learnt is None) is not (usual.learnt is None):
+        raise MampcError("state: expected gains learnt where the regulator learns them, and none elsewhere")
+    for place, shape in state.shapes().items():
+        if place == "controller.memory":  # what a rule around a controller keeps; it knows what fits
+            continue
+        may_be_none = place in further
+        zone = (
+            place == "reference" and expected[place] is not None and shape == (2, *np.shape(usual.sensors.y))
+        )
+        if shape != expected[place] and not (may_be_none and shape is None) and not zone:
+            raise MampcError(f"state: expected {place} of shape {expected[place]}, received {shape}")
+    for part, held in (("estimate", state.estimate), ("learnt", state.learnt)):
+        for name in ("weights", "usual", "usual_weights"):
+            shares = getattr(held, name, np.ones(1))
+            if (shares < 0).any() or not abs(shares.sum() - 1) < 1e-9:
+                raise MampcError(f"state: expected {part}.{name} that sum up to 1, received {shares}")
+    if state.learnt is not None and not (np.abs(state.learnt.factors - 1) <= MOST).all():
+        raise MampcError(
+            f"state: expected learnt.factors within {MOST:g} of 1, received {state.learnt.factors}"
+        )
+    scale = getattr(state.estimate, "scale", np.ones(1))
+    if not (scale > 0).all():
+        raise MampcError(f"state: expected positive numbers at estimate.scale, received {scale}")
+    squares = getattr(state.estimate, "sums", np.zeros(2))[1]
+    if squares < 0:
+        raise MampcError(f"state: expected a sum of squares at estimate.sums, received {squares}")
+    if not active_flags(state.controller.active):
+        raise MampcError(f"state: expected flags at controller.active, received {state.controller.active}")
+    late = state.actuators.late
+    if not np.isin(late, np.arange(LATEST + 1)).all():
+        raise MampcError(f"state: expected whole numbers up to {LATEST} at actuators.late, received {late}")
+    return state

@@ -20,8 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from mampc.base.checks import Array, as_array, as_one_or_each, as_vector
+from mampc.base.checks import Array, as_array, as_instance, as_one_or_each, as_vector
 from mampc.base.errors import MampcError
+from mampc.controllers.controller import Controller
+from mampc.controllers.mampc import MAMPC
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,3 +121,20 @@ class Compensation:
         # Where limits do not cut the input short, the stem is where it was planned, to the last digit.
         reached = np.where(u == planned + self._kinetic * way, planned, u - self._kinetic * np.sign(force))
         return u, np.where(slips, reached, position)
+
+
+def compensation_of(valves: Valves, controller: Controller) -> Compensation:
+    """That of a controller's valves; raises `MampcError` where its moves are not executed."""
+    compensation = Compensation(as_instance("valves", valves, Valves), controller.problem.model.n_inputs)
+    for one in controller.each:
+        if type(one) is not MAMPC or one.levels is not None:
+            raise MampcError(
+                f"valves: expected a MAMPC of inputs without levels, or a bank of them, received {type(one).__name__}"
+            )
+        size = as_vector("min_size", one.rules.min_size, controller.problem.model.n_inputs)
+        if ((size <= compensation.jump) & (compensation.jump > 0)).any():
+            raise MampcError(
+                f"valves: expected rules with a min_size above the jump of {compensation.jump}, since smaller moves "
+                f"are not executed, received {size}"
+            )
+    return compensation
