@@ -48,6 +48,7 @@ class Loop:
     reference_filter: mampc.ReferenceFilter | None = None
     counts: bool = False  # on later data, where that can be
     follows: bool = False  # the noise, with its price, where that can be
+    learns: bool = False  # gains, where that can be
     other: tuple[Any, ...] | None = None  # problem, rules, method and settings of a second variant
 
     @property
@@ -76,14 +77,19 @@ class Loop:
             "sensors": self.sensors, "max_blind_steps": self.max_blind_steps, "reference_filter": self.reference_filter
         }  # fmt: skip
         on = {"value_of_information": True, "price_follows_noise": True}
-        for tried in ([on] if self.follows else []) + (
-            [{"value_of_information": True}] if self.counts else []
-        ):
-            try:
-                return mampc.Regulator(controller, self.estimator, **settings, **tried)
-            except mampc.MampcError:  # another estimator or method, or inputs on levels
-                continue
-        return mampc.Regulator(controller, self.estimator, **settings)
+        told = (
+            ([on] if self.follows else []) + ([{"value_of_information": True}] if self.counts else []) + [{}]
+        )
+        for learns in (True, False) if self.learns else (False,):
+            for tried in told:
+                try:
+                    return mampc.Regulator(
+                        controller, self.estimator, learn_gains=learns, **settings, **tried
+                    )
+                except mampc.MampcError:  # another estimator or method, inputs on levels, or inputs alike
+                    if tried == {} and not learns:
+                        raise
+        return None
 
 
 @st.composite
@@ -230,7 +236,10 @@ def loops(draw):
     blind = draw(st.sampled_from([0, 0, 2, 5]))
     counts = draw(st.booleans())
     follows = counts and draw(st.booleans())
-    return Loop(problem, rules, method, settings, estimator, sensors, blind, smooth, counts, follows, other)
+    learns = draw(st.booleans())
+    return Loop(
+        problem, rules, method, settings, estimator, sensors, blind, smooth, counts, follows, learns, other
+    )
 
 
 # Faults. Each is drawn for as many signals as there can be, and cut to those that there are.

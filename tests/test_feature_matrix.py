@@ -22,6 +22,7 @@ ROWS = {
     "bank": {},
     "valves": {},
     "limits, manual": {},
+    "learnt gains": {},
 }  # fmt: skip
 RULES = {
     "levels": {"levels": [[0.0, 1.0, 2.0, 2.5, 4.0], 0.5]},
@@ -77,6 +78,8 @@ def made(feature, place, method="exact", **settings):
         loop["reference_filter"] = mampc.ReferenceFilter(time_constant=2.0, rate=0.5)
     if feature == "valves":
         loop["valves"] = mampc.Valves(band=0.2, jump=0.05)
+    if feature == "learnt gains":
+        loop |= {"estimator": mampc.LoadBank(model(), noise=0.05), "learn_gains": True}
     return mampc.Regulator(controller, **loop)
 
 
@@ -182,6 +185,7 @@ WORDS = {
         "SCENARIO": "limits = [{ at = 2, u_max = [1.5, 3.0] }]\n"
         'manual = [{ at = 3, until = 5, input = "INPUT", value = 1.0 }]',
     },
+    "learnt gains": {"CONTROLLER": "learn_gains = true\n[estimator]\nmeasurement_noise = 0.05"},
     "valves": {"SCENARIO": "valves = { band = 0.2, jump = 0.05 }", "CONTROLLER": "compensate = true"},
 }  # fmt: skip
 

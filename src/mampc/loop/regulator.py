@@ -66,7 +66,7 @@ class Regulator:
             plan and changes of decisions. Moves of less than `jump` are not executed, so that rules have at least that
             for `min_size`, and some more.
         learn_gains: correct the gains of the model while the loop runs, where that predicts better (see
-            docs/models.md). Needs an estimator that was told the noise. States of the model belong to one input each then.
+            docs/models.md). Needs an estimator that was told the noise. States then belong to one input each.
 
     Raises:
         MampcError: arguments of other types, an estimator of a model of other dimensions, gains that cannot be learnt.

@@ -124,7 +124,7 @@ def fitting_state(text: str, usual: RegulatorState, further: dict[str, tuple[int
     state, expected = RegulatorState.from_json(text), usual.shapes() | further
     if type(state.estimate) is not type(usual.estimate):
         raise MampcError(
-            f"state: expected a {type(usual.estimate).__name__}, received another estimator's estimate"
+            f"state: expected an estimate of the kind {type(usual.estimate).__name__}, received another estimator's"
         )
     if (state.learnt is None) is not (usual.learnt is None):
         raise MampcError("state: expected gains learnt where the regulator learns them, and none elsewhere")

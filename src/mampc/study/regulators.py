@@ -47,7 +47,8 @@ def regulator_of(study: Study, model: StateSpace, table: ControllerTable) -> Reg
     with said_at(f"controllers, {table.name!r}: "):
         return Regulator(
             controller, estimator, reference_filter=smooth, valves=valves, value_of_information=counts,
-            price_follows_noise=bool(counts) and study.estimator.price_follows_noise, **_sensors(study),
+            price_follows_noise=bool(counts) and study.estimator.price_follows_noise,
+            learn_gains=table.learn_gains, **_sensors(study),
         )  # fmt: skip
 
 

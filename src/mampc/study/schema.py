@@ -195,6 +195,7 @@ class ControllerTable(Table):
     violation_margin: Values = 0.0
     reference_filter: ReferenceFilterTable | None = None
     compensate: bool = False
+    learn_gains: bool = False
     published: PublishedTable | None = None
     variants: list[Word] = []
 
@@ -354,10 +355,10 @@ class Study(Table):
         if asked and not banks:
             raise ValueError(f"switches of scenarios with a controller of the method {BANK!r}; received none")
         for table in self.controllers:
-            own = table.compensate or table.reference_filter is not None
+            own = table.compensate or table.learn_gains or table.reference_filter is not None
             if own and any(table.name in bank.variants for bank in banks):
                 raise ValueError(
-                    f"neither compensate nor a reference_filter of {table.name!r}, a variant of a bank"
+                    f"neither compensate, learn_gains nor a reference_filter of {table.name!r}, a variant of a bank"
                 )
         for table in banks:
             if not set(table.variants) <= set(alone) or not asked <= set(table.variants):
