@@ -1,6 +1,6 @@
 """What gains learnt while the loop runs are worth: error, moves and cost in the end, beside the same loop without.
 
-    python benchmarks/learnt_online.py [--seeds 6] [--only off]
+    python benchmarks/learnt_online.py [--seeds 5] [--only off]
 
 800 samples under wandering loads or random steps, and set-point changes every 100 samples; the last quarter counts. The
 exact price with a load bank, at one price, with and without `learn_gains=True`. Plants:
@@ -85,9 +85,9 @@ def ends(case: Case, load: str, seed: int) -> tuple[np.ndarray, list[int]]:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--seeds", type=int, default=6)
-    parser.add_argument("--only", choices=KINDS)
-    parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--only", choices=KINDS, help="of the plants; default all")
+    parser.add_argument("--verbose", action="store_true", help="every run")
     given = parser.parse_args()
     for kind in KINDS if given.only is None else (given.only,):
         logs, counts = [], []
