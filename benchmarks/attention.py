@@ -5,7 +5,8 @@
 Every method has one knob and three structures (how fast the estimator's loads drift, or the tail of the horizon).
 In scenarios of its own each structure is run over the knob for every plant and load; the one with the fewest moves at
 1.25 times plain MPC's error goes on, about the knob that led there, in other scenarios, from which the results come.
-All methods are tuned alike, with the same number of simulations.
+All methods are tuned alike, with the same number of simulations. Then those of `IN_ONE_SETTING` are measured with the
+one structure that moved least in the tuning over all plants and loads.
 
 What is finished is kept line by line in benchmarks/results/attention/, and a run that was killed goes on from there.
 Results and what made them go to benchmarks/results/attention.json, tables and the heat map to docs/comparison.md.
@@ -105,6 +106,7 @@ METHODS = {
     "CLOT on moves": DRIFTS,
     "l0 on inputs": DRIFTS[1:2],
 }
+IN_ONE_SETTING = "exact price, load bank", "dead-band", "rounding, hysteresis"
 LIMITS = ("non-anticipative", "clairvoyant")
 EVERYTHING = METHODS | dict.fromkeys(LIMITS, ())
 
@@ -145,20 +147,57 @@ def cell(name: str, kind: str, method: str, quick: bool) -> dict:
         return row(
             name, kind, method, None, None, [baseline, *limit(method, case, kind, *around, baseline)], began
         )
-    knobs, about = (KNOB[::2], ABOUT[::4]) if quick else (KNOB, ABOUT)
-    tuning, evaluation = (TUNING[:1], EVALUATION[:2]) if quick else (TUNING, EVALUATION)
-    base, baseline = (baseline_of(name, kind, seeds) for seeds in (tuning, evaluation))
-    structures = EVERYTHING[method]
-    each = [measured(case, kind, method, structure, knobs, tuning) for structure in structures]
-    at = [moves_at(own, base, RATIO).value for own in each]
+    each = tuning_of(name, kind, method, quick)
+    at = [moves for moves, _ in each]
     best = int(np.argmin(np.where(np.isfinite(at), at, np.inf)))
-    knob, structure = knob_at(each[best], base), structures[best]
-    points = measured(case, kind, method, structure, knob * about, evaluation)
+    structure = EVERYTHING[method][best]
+    points = evaluation_of(name, kind, method, structure, each[best][1], quick)
+    return row(name, kind, method, structure, each, points, began)
+
+
+def tuning_of(name: str, kind: str, method: str, quick: bool) -> list[tuple[float, float]]:
+    """Moves over plain MPC's of each structure, not-a-number where never within the error, and the knob there."""
+    knobs, seeds = (KNOB[::2], TUNING[:1]) if quick else (KNOB, TUNING)
+    base = baseline_of(name, kind, seeds)
+    each = [measured(cases()[name], kind, method, own, knobs, seeds) for own in EVERYTHING[method]]
+    return [(moves_at(points, base, RATIO).value, knob_at(points, base)) for points in each]
+
+
+def evaluation_of(
+    name: str, kind: str, method: str, structure: tuple, knob: float, quick: bool
+) -> list[Point]:
+    """Plain MPC, and a method about a value of its knob, in other scenarios than those of the tuning."""
+    case, about = cases()[name], ABOUT[::4] if quick else ABOUT
+    seeds = EVALUATION[:2] if quick else EVALUATION
+    baseline = baseline_of(name, kind, seeds)
+    points = measured(case, kind, method, structure, knob * about, seeds)
     if not np.isfinite(
         moves_at(points, baseline, RATIO).value
     ):  # what led there in other scenarios was too much here
-        points = [*measured(case, kind, method, structure, knob * about * LOWER, evaluation), *points]
-    return row(name, kind, method, structure, at[best], [baseline, *points], began)
+        points = [*measured(case, kind, method, structure, knob * about * LOWER, seeds), *points]
+    return [baseline, *points]
+
+
+def measure_in_one_setting(method: str, journal: Journal, quick: bool) -> None:
+    """The structure of a finished method that is best in the tuning over all cells, measured in every one."""
+    rows = [journal.done[str((name, kind))][0] for kind in LOADS for name in cases()
+            if str((name, kind)) in journal.done]  # fmt: skip
+    if len(rows) < len(LOADS) * len(cases()):
+        return
+    tuned = np.array([row["tuned to"] for row in rows])[..., 0]  # (cells, structures)
+    best = int(np.log(np.where(np.isfinite(tuned), tuned, 1.0)).mean(axis=0).argmin())
+    structure = EVERYTHING[method][best]
+    for own in rows:
+        name, kind = own["plant"], own["load"]
+        task = str((name, kind, "in one setting"))
+        if task in journal.done:
+            continue
+        if tuple(own["structure"]) != structure:
+            began = time.process_time()
+            points = evaluation_of(name, kind, method, structure, own["tuned to"][best][1], quick)
+            own = row(name, kind, method, structure, own["tuned to"], points, began)
+        journal.add(task, [own])
+        print(f"in one setting: {name}, {kind}, {method}", file=sys.stderr)
 
 
 def row(
@@ -215,14 +254,20 @@ def run(
         left = (time.time() - began) / number * (len(missing) - number)
         told = ", ".join(found[key] for key in ("plant", "load", "method"))
         print(f"{number} of {len(missing)}, {left / 60:.0f} min left: {told}", file=sys.stderr)
+    for method in IN_ONE_SETTING:
+        if method in (methods or EVERYTHING):
+            measure_in_one_setting(method, journals[method], quick)
 
 
 def collect(journals: dict[str, Journal], quick: bool) -> None:
     """All that is finished, and what made it, into attention.json."""
-    rows = [
-        row
-        for name in cases() for kind in LOADS for method in EVERYTHING
-        for row in journals[method].done.get(str((name, kind)), [])
+    rows, alike = [
+        [
+            row
+            for name in cases() for kind in LOADS for method in EVERYTHING
+            for row in journals[method].done.get(str((name, kind, *setting)), [])
+        ]
+        for setting in ((), ("in one setting",))
     ]  # fmt: skip
     made_by = {
         "command": "python benchmarks/attention.py" + (" --quick" if quick else ""),
@@ -231,8 +276,8 @@ def collect(journals: dict[str, Journal], quick: bool) -> None:
         "samples": STEPS, "scenarios to tune in": len(TUNING[:1] if quick else TUNING),
         "scenarios to measure in": len(EVALUATION[:2] if quick else EVALUATION),
     }  # fmt: skip
-    lines = ",\n".join(json.dumps(row) for row in rows)
-    text = f'{{"made by": {json.dumps(made_by, indent=1)},\n"cells": [\n{lines}\n]}}\n'
+    lines, same = (",\n".join(json.dumps(row) for row in some) for some in (rows, alike))
+    text = f'{{"made by": {json.dumps(made_by, indent=1)},\n"cells": [\n{lines}\n],\n"in one setting": [\n{same}\n]}}\n'
     (RESULTS / f"{name_of(quick)}.json").write_text(text, encoding="utf-8")
 
 

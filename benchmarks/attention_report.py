@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,7 +58,8 @@ def told(results: Path) -> tuple[str, Cells, list[str]]:
         *under_rules(cells),
         by_load(cells, methods),
     ]
-    parts += [by_ratio(cells, methods), losses(cells, methods), by_cell(cells, methods)]
+    parts += [by_ratio(cells, methods), *in_one_setting(cells, cells_of(content["in one setting"]))]
+    parts += [losses(cells, methods), by_cell(cells, methods)]
     if any(name in cell for cell in cells.values() for name in LIMITS):
         parts.append(limits(cells))
     return "\n\n".join(parts), cells, methods
@@ -211,6 +213,43 @@ def by_ratio(cells: Cells, methods: list[str]) -> str:
         row = [mean([c[method][ratio].value for c in cells.values()]) for ratio in RATIOS]
         lines.append("| " + " | ".join([method, *row]) + " |")
     return "\n".join(lines)
+
+
+def in_one_setting(cells: Cells, alike: Cells) -> list[str]:
+    """Ours with one structure everywhere over rivals with one everywhere, and over the best tuned per cell."""
+    methods = [
+        name for name in alike.get(next(iter(cells)), {}) if all(name in alike.get(w, {}) for w in cells)
+    ]
+    if OURS[0] not in methods:
+        return []
+    kinds = list(dict.fromkeys(load for _, load in cells))
+
+    def row(name: str, other: Callable[[tuple[str, str]], Moves]) -> str:
+        own = {where: factor(alike[where][OURS[0]][RATIO], other(where)) for where in cells}
+        texts = []
+        for kind in [*kinds, None]:
+            factors = [f for (_, load), (f, _) in own.items() if kind in (None, load)]
+            reached = [f for f in factors if 0 < f < np.inf]
+            text = f"{np.exp(np.log(reached).mean()):.2f}" if reached else "-"
+            texts.append(
+                text if len(reached) == len(factors) else f"{text} ({len(reached)} of {len(factors)})"
+            )
+        fewer = sum(f < 1 and np.log(max(f, 1e-9)) < -SURE * e for f, e in own.values())
+        more = sum(np.isinf(f) or (f > 1 and np.log(f) > SURE * e) for f, e in own.values())
+        return "| " + " | ".join([name, *texts, f"{fewer} / {more}"]) + " |"
+
+    rows = [row(f"{name}, in one setting", lambda w, n=name: alike[w][n][RATIO]) for name in methods[1:]]
+    return ["\n".join([
+        f"**In one setting.** Here every method has the one structure that moved least in the tuning over all plants "
+        f"and loads, and only the knob is found for each. Moves of {OURS[0]} at {RATIO:g} times plain MPC's error over "
+        f"those of others, geometric mean over the plants, and in how many cells they are fewer / more by more than "
+        f"{SURE:g} standard errors:",
+        "",
+        "| over | " + " | ".join(kinds) + " | all | fewer / more |",
+        "|---|" + "---|" * (len(kinds) + 2),
+        *rows,
+        row("the best rival of each cell, its structure tuned there", lambda w: best_rival(cells[w])[1]),
+    ])]  # fmt: skip
 
 
 def losses(cells: Cells, methods: list[str]) -> str:
