@@ -140,7 +140,8 @@ def test_at_most_three_controllers_stand_out(count):
 
 
 def test_the_figures_of_a_study_are_legible_and_say_what_they_show():
-    text = template().replace("steps = 145", "steps = 40").replace("at = 100", "at = 30")
+    text = template().replace("steps = 145", "steps = 40").replace("prbs_order = 8", "prbs_order = 7")
+    text = text.replace("at = 100", "at = 30")
     result = run_study(parse_study(text))
     drawings = list(study_figures(result))
     names = [drawing.name for drawing in drawings]

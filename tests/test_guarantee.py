@@ -8,9 +8,12 @@ from hypothesis import strategies as st
 import mampc
 from builders import random_model
 from referees import counted, keeps_dwell
-from seeds import examples
+from seeds import deep, examples
 
 with_either_estimator = pytest.mark.usefixtures("either_estimator")
+mostly_load_bank = pytest.mark.parametrize(
+    "either_estimator", ["load bank", *deep("kalman filter")], indirect=True
+)
 
 STEPS = examples(30, quick=24)
 POLISHED = {name: {"polish": True, "warm_up": 0} if name == "alternating" else {} for name in mampc.METHODS}
@@ -103,6 +106,7 @@ def test_applied_moves_of_the_exact_method_keep_the_rules(loop):
 
 
 @with_either_estimator
+@mostly_load_bank
 @pytest.mark.parametrize("method", [name for name in POLISHED if name != "exact"])
 @given(loop=loops())
 @settings(max_examples=examples(20, quick=3), deadline=None)
@@ -125,6 +129,7 @@ def test_the_budget_is_spent_and_dwell_times_end(method):
 
 
 @with_either_estimator
+@mostly_load_bank
 @pytest.mark.parametrize("method", POLISHED)
 @pytest.mark.parametrize("counting", ["elementwise", "simultaneous"])
 def test_after_manual_operation_no_move_is_made_until_the_window_has_room(method, counting):

@@ -138,7 +138,12 @@ def test_a_run_that_is_not_there_is_refused_before_anything_is_identified(tmp_pa
     assert "identifying" not in outcome.output
 
 
-SHORT = template().replace("steps = 145", "steps = 30").replace("skip = 15", "skip = 5")
+SHORT = (
+    template()
+    .replace("steps = 145", "steps = 30")
+    .replace("skip = 15", "skip = 5")
+    .replace("prbs_order = 8", "prbs_order = 6")
+)
 
 
 def test_every_trajectory_of_a_study_replays_from_the_command_line(tmp_path, few_figures):

@@ -19,7 +19,12 @@ pytest.importorskip("plotly", reason="needs plotly, which mampc[report] brings")
 
 NASTY = '</script><img src=x onerror=alert(1)> $1 & "2" {3}'
 LONG = "without noise and with a name as long as a window on a telephone is never wide"
-SHORT = template().replace("steps = 145", "steps = 40").replace("at = 100", "at = 30")
+SHORT = (
+    template()
+    .replace("steps = 145", "steps = 40")
+    .replace("at = 100", "at = 30")
+    .replace("prbs_order = 8", "prbs_order = 6")
+)
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,13 @@ from mampc.study.regulators import regulator_of
 from mampc.study.running import prepare, run_controller
 
 
+def short_study(name):
+    """The built-in one, with less to run."""
+    study = load_study(name)
+    shorter = study.identification.model_copy(update={"prbs_order": 6})
+    return study.model_copy(update={"steps": 50, "identification": shorter})
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """The page of one short case with a small grid."""
@@ -22,7 +29,7 @@ def written(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setattr(reproduction, "CASES", {"quadruple-tank": {"penalty": [1.0, 10.0], "noise": [0.1]}})
     patch.setattr(reproduction, "study_figures", lambda result: islice(study_figures(result), 2))
-    patch.setattr(reproduction, "load_study", lambda name: load_study(name).model_copy(update={"steps": 50}))
+    patch.setattr(reproduction, "load_study", short_study)
     patch.setattr(output, "FIGURE_KINDS", ("svg",))
     with parallel_config("sequential"):  # processes would take longer to start than the runs
         cases = reproduction.reproduce(folder)
@@ -107,8 +114,7 @@ def test_the_claim_holds_where_changes_fall_and_the_error_hardly_rises():
 
 
 def test_progress_counts_every_run():
-    study = load_study("quadruple-tank")
-    short = study.model_copy(update={"steps": 20, "skip": 0})
+    short = short_study("quadruple-tank").model_copy(update={"steps": 20, "skip": 0})
     seen = []
     points = sensitivity(
         short, short.scenarios[0], short.controllers[3], {"penalty": [1.0, 10.0], "max_moves": [2]}, jobs=1,

@@ -28,7 +28,8 @@ rules = { price = 1.0 }
 def study(controllers):
     text = template()
     start = text.index("[[controllers]]")
-    return parse_study(text[:start].replace("steps = 145", "steps = 30") + controllers)
+    text = text[:start].replace("steps = 145", "steps = 30").replace("prbs_order = 8", "prbs_order = 6")
+    return parse_study(text + controllers)
 
 
 def test_a_study_runs_rivals_beside_each_other():

@@ -22,6 +22,7 @@ SHORT = (
     .replace("steps = 145", "steps = 30")
     .replace("at = 50", "at = 12")
     .replace("at = 100", "at = 20")
+    .replace("prbs_order = 8", "prbs_order = 6")
 )
 HEAD, _ = SHORT.split("[[scenarios]]", 1)
 TAIL = """

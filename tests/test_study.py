@@ -329,7 +329,8 @@ def test_the_template_shows_every_key():
 
 def test_what_the_template_shows_in_comments_can_be_said():
     """Zones that change, ranks, resting values, banks and switches, all at once."""
-    text = template().replace("steps = 145", "steps = 60").replace("at = 100", "at = 55")
+    text = template().replace("steps = 145", "steps = 60").replace("prbs_order = 8", "prbs_order = 6")
+    text = text.replace("at = 100", "at = 55")
     for key in (
         "zone_below",
         "zone_above",

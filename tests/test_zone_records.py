@@ -200,6 +200,7 @@ def test_zones_that_do_not_fit_are_refused_before_the_loop_begins(zone, said):
 SHORT = (
     template().replace("steps = 145", "steps = 30").replace("skip = 15", "skip = 5").replace("at = 50", "at = 8")
     .replace("at = 100", "at = 20").replace("# zone_below", "zone_below").replace("# zone_above", "zone_above")
+    .replace("prbs_order = 8", "prbs_order = 6")
 )  # fmt: skip
 
 
