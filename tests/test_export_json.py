@@ -44,6 +44,29 @@ def test_json_with_a_word_null_or_nothing_for_a_value_has_a_gap_there(tmp_path):
     assert len(read(tmp_path, json.dumps(without)).records) == 2
 
 
+def test_records_under_their_tags_are_a_tall_table_and_states_of_the_system_are_words(tmp_path):
+    def item(k: int, name: str, value: object) -> dict[str, object]:
+        good = not isinstance(value, dict)
+        return {
+            "Timestamp": RECORDS[k]["time"], "Value": value, "UnitsAbbreviation": "", "Good": good,
+            "Questionable": False, "Substituted": False, "Annotated": False,
+        }  # fmt: skip
+
+    bad = {"Name": "Bad Input", "Value": 255, "IsSystem": True}
+    for fault, lengths in (({}, [len(U)]), ({7: bad}, [7, len(U) - 8])):
+        streams = [
+            {
+                "WebId": f"F1{name}", "Name": name, "Links": {}, "UnitsAbbreviation": "m",
+                "Items": [item(k, name, (fault if name == "y" else {}).get(k, r[name])) for k, r in enumerate(RECORDS)],
+            }
+            for name in "uy"
+        ]  # fmt: skip
+        export = read(tmp_path, json.dumps({"Links": {"First": "?"}, "Items": streams}))
+        assert [len(record) for record in export.records] == lengths
+        assert dict(export.records[0].names.units) == {"u": "m", "y": "m"}
+        assert not fault or any("'Bad Input' (1," in note for note in export.notes)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

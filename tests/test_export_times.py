@@ -31,6 +31,62 @@ def test_dates_and_times_in_two_columns(tmp_path):
     assert_whole(read(tmp_path, text(lines, header=("Date", "Time", "u", "y"))), dt=7200.0)
 
 
+@pytest.mark.parametrize(
+    "form", ["%Y-%jT%H:%M:%S", "%Y-%j %H:%M:%S", "%Y/%j %H:%M", "%Y:%j:%H:%M:%S", "%Y-%jT%H:%M:%SZ"]
+)
+def test_days_of_the_year_go_on_over_its_end(tmp_path, form):
+    export = read(tmp_path, text(rows(stamps(start="2024-12-31 23:55:00", form=form))))
+    assert_whole(export)
+    assert export.starts[0].startswith("2024-12-31 23:55:00")
+    with pytest.raises(MampcError, match="expected times in column 'time'"):
+        read(tmp_path, text(rows([f"2023-366T00:{k:02d}:00" for k in range(len(U))])))
+
+
+@pytest.mark.parametrize(
+    ("form", "header"),
+    [
+        ("%m/%d/%Y %H %M", ("Date", "Hour", "Minute")),
+        ("%Y-%m-%d %H %M %S", ("DATE", "HH", "min", "Sec [s]")),
+        ("%Y %m %d %H %M", ("Year", "Month", "Day", "Hour", "Minute")),
+        ("%Y %j %H %M", ("YEAR", "DOY", "HOUR", "MINUTE")),
+    ],
+)
+@pytest.mark.parametrize("zeros", [True, False])
+def test_hours_and_minutes_in_columns_of_their_own(tmp_path, form, header, zeros):
+    times = stamps(start="2024-02-29 22:40:00", form=form)
+    cells = [
+        [part if zeros or "/" in part or "-" in part else str(int(part)) for part in t.split()] for t in times
+    ]
+    export = read(
+        tmp_path,
+        text([[*c, *r[1:]] for c, r in zip(cells, rows(times), strict=True)], header=(*header, "u", "y")),
+    )
+    assert_whole(export)
+    assert export.starts[0].startswith("2024-02-29 22:40:00")
+
+
+def test_a_column_called_hour_beside_stamps_or_with_other_numbers_is_no_time(tmp_path):
+    lines = [[time, "1.5", "3", *rest] for time, *rest in rows(stamps())]
+    assert_whole(read(tmp_path, text(lines, header=("time", "hour", "minute", "u", "y"))))
+    lines = [[time, "30.5", *rest] for time, *rest in rows(stamps(dt=86400.0, form="%Y-%m-%d"))]
+    assert_whole(read(tmp_path, text(lines, header=("date", "hour", "u", "y"))), dt=86400.0)
+
+
+def test_a_clock_put_back_while_samples_are_missing_is_told(tmp_path):
+    moments = pd.date_range("2024-10-26 22:30", periods=400, freq="1min", tz="UTC").tz_convert(
+        "Europe/Berlin"
+    )
+    lines = [
+        [f"{t:%Y-%m-%d %H:%M:%S}", f"{k % 7}", f"{k}"] for k, t in enumerate(moments) if not 145 <= k < 160
+    ]
+    export = read(tmp_path, text(lines))
+    assert [len(record) for record in export.records] == [145, 240]
+    assert told(export, "the clock goes back an hour after 2024-10-27 02:54:00")
+    assert told(export, "samples missing: 15 after")
+    swapped = [*lines[:30], *lines[31:60], lines[30], *lines[60:]]  # one row that comes half an hour late
+    assert not told(read(tmp_path, text(swapped[:140])), "the clock goes back")
+
+
 @pytest.mark.parametrize("form", ["%H:%M:%S", "%H:%M", "%I:%M:%S %p"])
 @pytest.mark.parametrize("newest_first", [False, True])
 def test_times_without_a_date_go_on_the_next_day_past_midnight_and_that_is_told(tmp_path, form, newest_first):

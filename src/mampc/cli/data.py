@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +10,7 @@ import typer
 from mampc.base.errors import MampcError
 from mampc.cli.app import app
 from mampc.cli.console import complain, console_for_tables, print_list, progress
+from mampc.cli.numbers import words
 from mampc.cli.reading import reads_exports
 
 Inputs = Annotated[
@@ -179,8 +179,3 @@ def show(
 
 def _columns(inputs: str, outputs: str, disturbances: str) -> dict[str, list[str]]:
     return {"inputs": words(inputs), "outputs": words(outputs), "disturbances": words(disturbances)}
-
-
-def words(text: str) -> list[str]:
-    """Words between commas; one that holds a comma stands in quotation marks."""
-    return [word.strip() for row in csv.reader([text], skipinitialspace=True) for word in row if word.strip()]

@@ -1,6 +1,8 @@
-"""Numbers on the command line: shares, times with a unit, rows between commas, matrices between semicolons."""
+"""Numbers on the command line: shares, times with a unit, rows between commas, matrices; and words."""
 
 from __future__ import annotations
+
+import csv
 
 from mampc.base.errors import MampcError, shown
 
@@ -45,3 +47,8 @@ def _quantity(name: str, text: str) -> float:
             f"{name}: expected numbers in the signal's own unit, such as 2.5, received {shown(text)}"
         )
     return number(name, text)
+
+
+def words(text: str) -> list[str]:
+    """Words between commas; one that holds a comma stands in quotation marks."""
+    return [word.strip() for row in csv.reader([text], skipinitialspace=True) for word in row if word.strip()]

@@ -10,7 +10,7 @@ import typer
 from mampc.base.errors import MampcError
 from mampc.cli.app import app
 from mampc.cli.console import console_for_tables, print_list
-from mampc.cli.numbers import matrix, number, row
+from mampc.cli.numbers import matrix, number, row, words
 
 
 @app.command(name="plan-test")
@@ -65,7 +65,6 @@ def plan_test(
         mampc plan-test test.csv --model tank.json
     """
     from mampc.base.names import Names
-    from mampc.cli.data import words
     from mampc.identification.plant_test import first_guess, hold_in_words
     from mampc.identification.plant_test import plan_test as plan
     from mampc.report.planning import plan_tables

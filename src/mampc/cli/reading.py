@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from mampc.base.errors import MampcError
+from mampc.cli.numbers import words
 
 PANEL = "How files are read"
 
@@ -41,7 +42,7 @@ def reading_options(
     ] = None,
     no_quality: Annotated[
         list[str] | None,
-        typer.Option(help="A column that says nothing of others though it is called so; repeat it."),
+        typer.Option(help="Columns that say nothing of others though they are called so."),
     ] = None,
     ranges: Annotated[
         list[str] | None,
@@ -55,15 +56,15 @@ def reading_options(
     ] = 0,
     on_change: Annotated[
         list[str] | None,
-        typer.Option(help="A column that is stored only when it changes: its last value holds; repeat it."),
+        typer.Option(help="Columns that are stored only when they change: their last value holds."),
     ] = None,
 ) -> dict[str, Any]:
     """These options as arguments of `read_export`."""
     return {
         "dt": dt, "time": time, "time_unit": time_unit, "time_format": time_format, "time_zone": time_zone,
         "decimal": decimal, "encoding": encoding, "bad": bad or (), "good": good or (),
-        "no_quality": tuple(no_quality or ()), "ranges": dict(map(_range, ranges or ())), "fill": fill,
-        "on_change": tuple(on_change or ()),
+        "no_quality": _names(no_quality), "ranges": dict(map(_range, ranges or ())), "fill": fill,
+        "on_change": _names(on_change),
     }  # fmt: skip
 
 
@@ -84,6 +85,10 @@ def reads_exports(command: Callable[..., None]) -> Callable[..., None]:
     called.__signature__ = own.replace(parameters=keywords)  # type: ignore[attr-defined]
     called.__annotations__ = {one.name: one.annotation for one in shown}
     return called
+
+
+def _names(texts: list[str] | None) -> tuple[str, ...]:
+    return tuple(name for text in texts or () for name in words(text))
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:

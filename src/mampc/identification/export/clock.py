@@ -13,6 +13,7 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import shown
 from mampc.identification.export.cells import clean, is_number, numeric_share, says_numbers
+from mampc.identification.export.date_parts import has_parts, part_columns, part_words
 from mampc.identification.export.date_words import plain_date
 from mampc.identification.export.daytime import (
     DAY,
@@ -143,6 +144,9 @@ def _seconds(
 
 def _words(sheet: Sheet, columns: Sequence[int], findings: Findings) -> Iterator[list[str]]:
     """The cells of the column, or of those of dates and times put together, the last date in empty cells."""
+    if has_parts(sheet, columns):
+        yield from part_words(sheet, columns)
+        return
     date, held = "", 0
     for cells in sheet.chunks(columns):
         if len(cells) == 1:
@@ -159,7 +163,7 @@ def _words(sheet: Sheet, columns: Sequence[int], findings: Findings) -> Iterator
 
 
 def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings: Findings) -> tuple[int, ...]:
-    """The column of times, or those of dates and of times of the day."""
+    """The column of times, or those of dates and of times of the day, or of their parts."""
     if how.time is not None:
         at = find_column(sheet.header, how.time)
         if at is None:
@@ -181,6 +185,9 @@ def time_columns(sheet: Sheet, taken: Sequence[int], how: TimeReading, findings:
     }
     dates, hours = shares["dates"], shares["hours"]
     stamps = [at for at in shares["stamps"] if at not in dates]
+    parts = () if stamps or hours else part_columns(sheet, free, dates)
+    if parts:
+        return parts
     if not stamps and len(dates) == len(hours) == 1:
         return (dates[0], hours[0])
     numeric = [

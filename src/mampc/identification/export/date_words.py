@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from calendar import isleap
+from datetime import date, timedelta
 
 # First letters that tell a month in English, German, French, Spanish, Italian, Dutch, Portuguese, Russian, Polish.
 MONTHS = (
@@ -39,6 +41,7 @@ DAY = re.compile(r"^(\d{1,2})\. ?(?=[^\W\d_])")
 AT = re.compile(r",? (?:klo|kl\.?|um|à|at|ore|alle|г\.,?) (?=\d)|, (?=\d)")  # between the date and the time
 HOURS = re.compile(r"(?<![\d:.])(\d{1,2}) ?h ?(\d\d)(?: ?m(?:in)? ?(\d\d) ?s?)?(?!\w)", re.IGNORECASE)
 POINTS = re.compile(r"(?<=\d )(\d{1,2})\.(\d\d)(?:\.(\d\d(?:\.\d+)?))?(?![\d.:])")
+ORDINAL = re.compile(r"^(\d{4})[-/.: ](\d{3})(?:[-:T ]+(?=\d)|$)", re.ASCII)  # a year and a day of it
 YEAR_POINT = re.compile(r"^(\d{4})\. ?(\d{1,2})\. ?(\d{1,2})\. ")
 
 
@@ -46,8 +49,10 @@ def plain_date(stamp: str) -> str:
     """A stamp without its day of the week, with an English month, the year beside it, and its offset behind the time.
 
     "Thu Nov 26 21:00:00 CET 2026" becomes "Nov 26 2026 21:00:00+0100", "02. März 2026 um 06.00" "02 Mar 2026 06:00",
-    "2/3/2026, 9:00 p. m." "2/3/2026 9:00 PM".
+    "2/3/2026, 9:00 p. m." "2/3/2026 9:00 PM", "2024-366T22:00" "2024-12-31 22:00".
     """
+    if stamp[5:8].isdecimal():
+        stamp = ORDINAL.sub(_day_of_year, stamp)
     words = any(map(str.isalpha, stamp))
     if words:
         stamp = HOURS.sub(_with_colons, TAIL.sub("", stamp))
@@ -78,6 +83,14 @@ def plain_date(stamp: str) -> str:
     if moved:
         stamp = f"{moved[1]} {moved[4]} {moved[2]} {moved[3] or ''}".strip()
     return OFFSET.sub(r"\1\2", stamp)
+
+
+def _day_of_year(found: re.Match[str]) -> str:
+    year, day = int(found[1]), int(found[2])
+    if year == 0 or not 0 < day <= 365 + isleap(year):
+        return found[0]
+    moment = date(year, 1, 1) + timedelta(days=day - 1)
+    return f"{moment} " if found.end() < len(found.string) else f"{moment}"
 
 
 def _with_colons(time: re.Match[str]) -> str:

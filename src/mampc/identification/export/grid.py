@@ -195,8 +195,8 @@ def _in_order(clock: Clock, numbers: npt.NDArray[np.int64], findings: Findings) 
     if not len(late):
         return known
     findings.change(
-        f"rows are not in the order of time, first in row {numbers[known[late[0] + 1]]} ({len(late)} steps back); "
-        "put in order"
+        f"rows are not in the order of time, first in row {numbers[known[late[0] + 1]]} "
+        f"({counted(len(late), 'step')} back); put in order"
     )
     return known[np.argsort(seconds, kind="stable")]
 
@@ -231,7 +231,7 @@ def _each_once(
     if contradicting and len(repeated) > MOST_UNEVEN * len(first):
         findings.doubt(
             f"expected a time for each sample, received {len(repeated)} of {len(first)} times more than once, first in "
-            f"row {min(rows)}; export times with more digits"
+            f"row {min(rows)}; export times with more digits, or with the column that tells their hours and minutes"
         )
         return None
     return order[first]

@@ -1,4 +1,4 @@
-"""JSON as web interfaces of historians give it: a list of records, lines of them, or a list for every column."""
+"""JSON as web interfaces of historians give it: records, lines or lists of them by tag, or a list for every column."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, shown
 
 OPENS = (b"{", b"[{")
 BOM = b"\xef\xbb\xbf"
-FORMS = "a list of records, a record a line, or a list for every column, each value a number, a word or null"
+FORMS = (
+    "a list of records, a record a line, a list of records for every tag, or a list for every column, each value a "
+    "number, a word, a state with a name, or null"
+)
 
 
 def is_json(content: bytes) -> bool:
@@ -41,7 +44,42 @@ def read_json(path: str | Path, content: bytes) -> Any:
     columns = found if isinstance(found, dict) else {}
     if not records and len(set(map(len, columns.values()))) != 1:
         raise MampcError(f"{path}: expected JSON with {FORMS}, received another form")
+    if records:
+        found = _by_tag(found)
+        found = [{key: _word(value) for key, value in record.items() if value != {}} for record in found]
+    else:
+        found = {key: list(map(_word, column)) for key, column in columns.items()}
     frame = pd.DataFrame(found)
-    if any(isinstance(cell, (dict, list)) for _, column in frame.items() for cell in column):
-        raise MampcError(f"{path}: expected JSON with {FORMS}, received lists or objects as values")
+    nested = [str(name) for name, column in frame.items() if any(isinstance(c, (dict, list)) for c in column)]
+    if nested:
+        raise MampcError(
+            f"{path}: expected JSON with {FORMS}, received lists or objects as values of {shown(nested[0])}"
+        )
     return frame
+
+
+def _by_tag(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Records that stand in a list within each of others, such as values under their tags, beside what those say."""
+    keys = {key for record in records for key, value in record.items() if _lists_records(value)}
+    if len(keys) != 1:
+        return records
+    [key] = keys
+    return [merged for record in records for merged in _merged(record, key)]
+
+
+def _merged(record: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    """What is said twice is as the inner record has it, unless that leaves it empty."""
+    about = {name: value for name, value in record.items() if name != key}
+    return [
+        about | {name: value for name, value in inner.items() if value != "" or name not in about}
+        for inner in record.get(key) or ()
+    ]
+
+
+def _lists_records(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(inner, dict) for inner in value)
+
+
+def _word(value: Any) -> Any:
+    """A state of a switch or of a system, an object with a name and a code, by its name."""
+    return value["Name"] if isinstance(value, dict) and {"Name", "Value"} <= value.keys() else value

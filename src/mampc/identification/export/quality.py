@@ -145,6 +145,7 @@ def drop_bad_quality(
         findings: receives a doubt where no word is known.
     """
     by_name = {column.name: column for column in columns}
+    taken: dict[tuple[str, ...], list[str]] = {}
     for at, names in quality_columns(sheet, positions, measured).items():
         words = [word.casefold() for word in sheet.words(at)]
         denies = DENIAL.search(sheet.header[at].casefold()) is not None
@@ -166,7 +167,11 @@ def drop_bad_quality(
             for i in np.flatnonzero(~is_good & ~np.isnan(column.values)):
                 column.mark(f"quality {shown(words[i])}", int(sheet.numbers[i]))
             column.values[~is_good] = np.nan
-        findings.note(f"column {sheet.header[at]!r} taken as the quality of {', '.join(names)}")
+        taken.setdefault(names, []).append(repr(sheet.header[at]))
+    for names, said_by in taken.items():
+        findings.note(
+            f"column{'s' * (len(said_by) > 1)} {', '.join(said_by)} taken as the quality of {', '.join(names)}"
+        )
 
 
 def _in_numbers(name: str, words: Sequence[str]) -> tuple[str, ...]:

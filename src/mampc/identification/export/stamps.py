@@ -311,7 +311,10 @@ def _localised(ticks: Ticks, zone: str, findings: Findings) -> Ticks:
 
 
 def clock_put_back(seconds: Array, origin: datetime, sheet: Sheet, findings: Findings) -> Array:
-    """Local time in the order of rows, with an hour added where the clock was put back an hour."""
+    """Local time in the order of rows, with an hour added where the clock was put back an hour.
+
+    It goes back by less where samples are missing just then: by half an hour at least, on a Sunday before four.
+    """
     known = np.flatnonzero(~np.isnan(seconds))
     steps = np.diff(seconds[known])
     if (steps < 0).sum() > (steps > 0).sum():  # the newest first
@@ -319,15 +322,22 @@ def clock_put_back(seconds: Array, origin: datetime, sheet: Sheet, findings: Fin
     if len(steps) < 3 or not (steps > 0).any() or origin.year == UNDATED.year:
         return seconds
     usual = float(np.median(steps[steps > 0]))
-    back = np.flatnonzero((np.abs(steps - (usual - HOUR)) <= 0.3 * usual) & (steps <= 0))
+    straight = np.abs(steps - (usual - HOUR)) <= 0.3 * usual
+    behind_gap = (steps > usual - HOUR) & (steps < -HOUR / 2)
+    back = np.flatnonzero((straight | behind_gap) & (steps <= 0))
     if not 0 < len(back) <= 3 or (steps[np.setdiff1d(np.arange(len(steps)), back)] <= 0).mean() > 0.001:
         return seconds
     corrected = seconds.copy()
     for i in back:
         moment = origin + timedelta(seconds=float(seconds[known[i]]))
-        if usual >= HOUR and not (moment.weekday() == 6 and moment.hour <= 3):
+        if usual < HOUR and straight[i]:
+            pass
+        elif not (moment.weekday() == 6 and moment.hour <= 3):
             continue
-        if usual >= HOUR and _same_cells(sheet, int(known[i]), int(known[i + 1])):
+        elif any(
+            _same_cells(sheet, int(known[k]), int(known[i + 1]))
+            for k in np.flatnonzero(seconds[known[: i + 1]] == seconds[known[i + 1]])
+        ):
             continue  # one row that stands twice
         corrected[known[i + 1 :]] += HOUR
         findings.change(

@@ -19,7 +19,7 @@ TAGS = (
     "field",
 )  # fmt: skip
 VALUES = ("value", "val", "varvalue", "wert", "valeur", "valor", "valore", "waarde")
-UNITS = ("unit", "units", "eu", "engunits", "einheit", "unité", "unidad")
+UNITS = ("unit", "units", "unitsabbreviation", "eu", "engunits", "einheit", "unité", "unidad")
 MOST_TAGS = 2000
 
 
