@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from mampc import IOData, prbs
+from mampc import IOData, MampcWarning, n4sid, prbs
 from mampc.identification.excitation import answering
 
 
@@ -30,6 +30,11 @@ def test_a_controller_without_a_test_is_named_in_any_units(load, scale):
     assert "u1 follows from the outputs" in said
     assert answering(loop(1.0, 1.0, load, scale)) == []
     assert answering(loop(1.0, 0.0, load, scale)) == []
+
+
+def test_n4sid_warns_of_them():
+    with pytest.warns(MampcWarning, match="u1 follows from the outputs"):
+        n4sid(loop(0.0, 1.0, "wave"), order=1)
 
 
 def test_a_test_of_two_levels_seen_within_the_sample_is_not_named():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -9,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array, as_array, as_choice, as_matrix, as_whole
-from mampc.base.errors import MampcError
+from mampc.base.errors import MampcError, MampcWarning
 from mampc.identification.choices import ENOUGH, Choice, block_rows_for, chosen, estimated
 from mampc.identification.closed_loop import certainly_unstable, estimate_predictor, under_feedback
 from mampc.identification.data import IOData
 from mampc.identification.delays import Integers
 from mampc.identification.drift import noise_and_walk
 from mampc.identification.estimate import DEGREES, Settings
+from mampc.identification.excitation import answering
 from mampc.identification.parts import Part, assembled, part_residuals
 from mampc.identification.scaling import Scaled, scaled
 from mampc.identification.subspace import WEIGHTINGS
@@ -132,6 +134,9 @@ def n4sid(
             default those that show in the record, if they exceed `SHORT` and predict held-out data.
         progress: is told each stage in a few words; long records with many signals take some seconds.
 
+    Warns:
+        MampcWarning: inputs did nothing but answer outputs, so that the model says little of the plant.
+
     Raises:
         MampcError: a record too short, constant signals, or an unstable model with unstable="refuse".
     """
@@ -168,6 +173,8 @@ def n4sid(
             f"n4sid: expected records that a model can be computed from, received ones with {failure}; "
             "look for inputs that hardly move or move together, or give order and detrend"
         ) from failure
+    for said in answering(given):
+        warnings.warn(said, MampcWarning, stacklevel=2)
     integrators = sum(part.integrators for part in parts)
     notes = list(choice.notes)
     if integrators:

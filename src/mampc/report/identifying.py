@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mampc.base.checks import Array, as_number
-from mampc.base.errors import MampcError, counted
+from mampc.base.errors import MampcError, MampcWarning, counted
 from mampc.identification import Identified, IOData, Validation, n4sid
 from mampc.identification.excitation import left_open, movement_of
 from mampc.identification.export.together import read_together
@@ -105,7 +106,11 @@ def _identified(
     estimation, rest = hold_out(long_enough(records, notes), share)
     show("identifying a model")
     try:
-        identified = n4sid(estimation if len(estimation) > 1 else estimation[0], progress=show, **settings)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MampcWarning)  # `left_open` tells it of all records
+            identified = n4sid(
+                estimation if len(estimation) > 1 else estimation[0], progress=show, **settings
+            )
     except MampcError as error:
         told = [
             *movement_of(estimation),
@@ -116,21 +121,21 @@ def _identified(
     show("estimating how certain it is")
     evidence = evidence_of(identified, records, lambda words: show(f"estimating how certain it is{words}"))
     model = replace(identified.model, evidence=evidence)
-    warnings = []
+    doubts = []
     if identified.stabilised:
-        warnings.append(
+        doubts.append(
             "poles outside the unit circle were mirrored to its inside; check the record for drifts"
         )
     poor = [name for name, fit in zip(rest.names.outputs, validation.fit, strict=True) if not fit > POOR_FIT]
     if poor:
-        warnings.append(
+        doubts.append(
             f"the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at the "
             "figure, and try another --order or --detrend, or a richer record"
         )
-    warnings += left_open(model, records)
+    doubts += left_open(model, records)
     return Outcome(
         model, identified.order, identified.fit, replace(rest, u=rest.u.copy(), y=rest.y.copy()), validation,
-        identified.notes, tuple(notes), tuple(warnings), tuple(map(len, estimation)),
+        identified.notes, tuple(notes), tuple(doubts), tuple(map(len, estimation)),
     )  # fmt: skip
 
 
