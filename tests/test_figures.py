@@ -8,6 +8,7 @@ from mampc.base.drawing import outline
 from mampc.compare.sensitivity import SETTINGS, Point
 from mampc.loop.drawing import signals_figure
 from mampc.report.figures import (
+    file_words,
     moves_against_error,
     result_looks,
     sensitivity_figure,
@@ -110,6 +111,14 @@ def test_inputs_that_never_move_and_a_perfect_plant_can_be_drawn():
 def test_long_names_of_signals_are_inside_the_picture():
     names = mampc.Names((LONG, "$1$ {pump}"), (LONG + " 2",), units={LONG: "kg/h"})
     assert_legible(signals_figure({"MPC": run(1, names)}))
+
+
+def test_signals_whose_names_differ_in_marks_alone_have_files_of_their_own():
+    words = file_words(["TI-1", "TI 1", "ti.1", "TI-1-2", "overview", "level"])
+    assert len(set(words)) == 6
+    assert words[0] == "ti-1"
+    assert words[-1] == "level"
+    assert "overview" not in words
 
 
 def test_a_run_draws_itself_with_all_its_signals():

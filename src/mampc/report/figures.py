@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHOWN_OF_EXCITATION = 400  # samples
+OVERVIEW, TRADE = "overview", "moves-against-error"  # in names of files
 
 
 class Drawing(NamedTuple):
@@ -53,23 +55,38 @@ def study_figures(result: StudyResult) -> Iterator[Drawing]:
     for scenario, runs in result.runs.items():
         names = next(iter(runs.values())).names
         word, where = file_word(scenario), f"scenario {scenario}, {length}"
+        of_signals = iter(file_words(names.outputs + names.inputs))
         yield Drawing(
-            f"{word}_overview",
+            f"{word}_{OVERVIEW}",
             f"All outputs and inputs, {where}.",
             signals_figure(runs, look=look, limits=limits),
         )
         for kind, signals in (("Output", names.outputs), ("Input", names.inputs)):
             for name in signals:
                 yield Drawing(
-                    f"{word}_{file_word(name)}",
+                    f"{word}_{next(of_signals)}",
                     f"{kind} {names.with_unit(name)}, {where}.",
                     signals_figure(runs, [name], look=look, limits=limits, height=1.9),
                 )
         yield Drawing(
-            f"{word}_moves-against-error",
+            f"{word}_{TRADE}",
             f"How often inputs move against how well outputs follow, {where}; best is down to the left.",
             moves_against_error(runs, result.study.threshold, look, result.study.error_weight),
         )
+
+
+def file_words(names: Sequence[str]) -> list[str]:
+    """Signals as they stand in the names of their figures, each once: a number tells those apart that look alike."""
+    taken = Counter((OVERVIEW, TRADE))
+    words = []
+    for name in names:
+        word = file_word(name)
+        while taken[word]:
+            taken[word] += 1
+            word = f"{word}-{taken[word]}"
+        taken[word] += 1
+        words.append(word)
+    return words
 
 
 def result_looks(result: StudyResult) -> dict[str, Look]:
