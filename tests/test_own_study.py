@@ -62,6 +62,21 @@ def test_plans_count_on_later_data_but_where_the_plant_runs_away():
         assert regulator_of(study, MODELS[name], price).value_of_information is counts
 
 
+def test_filters_expect_the_noise_of_the_scenarios_where_the_model_knows_none():
+    """A guess by the inputs' range is beyond every change where inputs act against each other, and plans would wait."""
+    model = lags(
+        gain=[[2.5e4, -1e4], [3e-6, 8e-6]], time_constant=[[5.0, 8.0], [20.0, 30.0]], dt=1.0, u_op=[50.0, 0.3]
+    )
+    study = parse_study(own_study(model, "m.json", "own"))
+    assert study.estimator.measurement_noise == study.scenarios[1].noise
+    changes = np.array([change.value for change in study.reference.changes])
+    price = next(table for table in study.controllers if table.name == "price")
+    offset = regulator_of(study, model, price).largest_offset()
+    assert (offset < 0.5 * np.abs(changes).max(axis=0)).all()
+    known = parse_study(own_study(replace(model, noise=Noise([100.0, 1e-8], [0.0, 0.0])), "m.json", "own"))
+    assert known.estimator.measurement_noise is None
+
+
 @pytest.mark.parametrize("kind", MODELS)
 def test_it_runs_at_once_and_its_price_pays(kind, tmp_path):
     result = ran(MODELS[kind], tmp_path)

@@ -236,10 +236,24 @@ def test_rules_without_any_are_plain_mpc():
 
 
 def test_limits_that_exclude_the_operating_point_are_told():
-    found = tuned(lag(u_op=[5.0]), limits=mampc.Limits(u_min=6.0, u_max=16.0))
-    assert len(found.cautions) == 1
-    assert "the limits of u1, 6 to 16, exclude the model's operating point, 5" in found.cautions[0]
-    assert tuned(lag()).cautions == ()
+    assert cautions_of(lag(), noise=0.1) == ()
+    (found,) = cautions_of(lag(u_op=[5.0]), low=6.0, high=16.0, noise=0.1)
+    assert "the limits of u1, 6 to 16, exclude the model's operating point, 5" in found
+
+
+def test_what_nobody_told_is_said():
+    (found,) = cautions_of(lag(), noise=None)
+    assert f"guessed {0.002 * 2.0 * 20.0 * (1 - np.exp(-4.2)):.3g} of y1" in found
+    names = mampc.Names(inputs=("u",), outputs=("y",), disturbances=("feed",))
+    model = mampc.StateSpace.from_first_order(gain=[[2.0, 1.0]], time_constant=50.0, dt=10.0, names=names)
+    (found,) = cautions_of(model, noise=0.1)
+    assert "(feed) rest in all scenarios" in found
+    assert cautions_of(model, noise=0.1, loads=[mampc.loads.RandomWalk(at="measured", size=0.1)]) == ()
+
+
+def cautions_of(model, *, low=-10.0, high=10.0, noise=None, loads=None):
+    problem = usual_problem(model, mampc.Limits(u_min=low, u_max=high), 1.0)
+    return scenarios.cautions(problem, scenarios.Surroundings.of(problem, noise, None, loads))
 
 
 def test_the_price_chosen_is_on_the_front_and_in_the_rows(tank):

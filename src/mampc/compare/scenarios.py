@@ -97,6 +97,36 @@ def every_kind(model: StateSpace, noise: Array, samples: int) -> tuple[tuple[Loa
     )
 
 
+def cautions(problem: TrackingProblem, around: Surroundings) -> tuple[str, ...]:
+    """What was assumed and may be far off, a sentence each: noise, measured disturbances, where scenarios rest."""
+    model, limits = problem.model, problem.limits
+    found = []
+    if around.guessed:
+        sizes = ", ".join(
+            f"{size:.3g} of {name}" for size, name in zip(around.noise, model.names.outputs, strict=True)
+        )
+        found.append(
+            f"nobody told the noise: guessed {sizes}, by the inputs' range; set-point changes and loads are sized by "
+            "it, so tell it where you know it (noise of a study's scenarios; `mampc new --model` writes one)"
+        )
+    if model.n_disturbances and not any(load.at == "measured" for kind in around.loads for load in kind):
+        found.append(
+            f"measured disturbances ({', '.join(model.names.disturbances)}) rest in all scenarios, since nobody told "
+            'how they move; tell it in loads with at = "measured"'
+        )
+    outside = (model.u_op < limits.u_min) | (model.u_op > limits.u_max)
+    found += [
+        f"the limits of {name}, {low:.5g} to {high:.5g}, exclude the model's operating point, {at:.5g}: scenarios rest "
+        "at the nearest limit instead, from which this input can move one way only; put in limits of the actuator, in "
+        "the model's units and not as deviations, or use a model of where the plant is run"
+        for name, low, high, at, out in zip(
+            model.names.inputs, limits.u_min, limits.u_max, model.u_op, outside, strict=True
+        )
+        if out
+    ]
+    return tuple(found)
+
+
 def even_weight(model: StateSpace, limits: Limits) -> Array:
     """Q of outputs whose errors count alike beside their noise, shape (l,), with 1 for one output or equal noises."""
     noise = Surroundings.of(usual_problem(model, limits, 1.0), None, None, None).noise

@@ -18,6 +18,7 @@ from mampc.loop.loads import Load
 from mampc.methods.registry import METHODS
 from mampc.moves.rules import MoveRules
 from mampc.program.levels import OnOff
+from mampc.study.draft import usual_threshold
 from mampc.study.regulators import regulator_of
 from mampc.study.running import Prepared, load_of
 from mampc.study.scenario_tables import (
@@ -109,7 +110,8 @@ def study_of_model(model: StateSpace, tuned: Tuned, name: str) -> Study:
         for number, kind in enumerate(tuned.loads)
     ]  # fmt: skip
     return Study(
-        name=name, steps=samples, dt=model.dt, plant=plant, model=ModelTable(file=MODEL_FILE),
+        name=name, steps=samples, dt=model.dt, plant=plant, threshold=usual_threshold(problem.limits),
+        model=ModelTable(file=MODEL_FILE),
         problem=_problem(tuned), reference=ReferenceTable(initial=[0.0] * len(size), changes=changes),
         scenarios=scenarios, controllers=[BASELINE],
     )  # fmt: skip

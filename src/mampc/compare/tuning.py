@@ -19,13 +19,13 @@ from mampc.compare.candidates import Candidate, candidates, is_dear
 from mampc.compare.fronts import Point, non_dominated
 from mampc.compare.promise import PLAIN, RULES_ALONE, Expected, Goal, moves_per_hour, ratio_over_kinds
 from mampc.compare.rounds import DEAR_ROUNDS, FINALISTS, HIGHER, ROUNDS, Work
-from mampc.compare.scenarios import Scenarios, Surroundings
+from mampc.compare.scenarios import Scenarios, Surroundings, cautions
 from mampc.compare.tuned import REFINE_SPAN, FrontPoint, Tuned
 from mampc.controllers import MAMPC, MPC
 from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.regulator import Regulator
 from mampc.moves.rules import MoveRules
-from mampc.program.problem import Limits, TrackingProblem
+from mampc.program.problem import Limits
 from mampc.program.usual import usual_problem
 from mampc.systems.state_space import StateSpace, as_discrete
 
@@ -124,7 +124,7 @@ def tune(
     return Tuned(
         problem if chosen is None else chosen.problem, replace(rules, price=price), expected, front, reached, plain,
         around.noise, chosen is not None and chosen.guessed, plain.estimator if chosen is None else chosen.estimator,
-        around.loads, rows, base.method if chosen is None else chosen.name, _cautions(problem),
+        around.loads, rows, base.method if chosen is None else chosen.name, cautions(problem, around),
     )  # fmt: skip
 
 
@@ -276,21 +276,6 @@ def _front(points: Sequence[Point], base: Point, goal: Goal) -> tuple[FrontPoint
         {*non_dominated(moves, errors).tolist(), len(points) - 1}, key=lambda i: (errors[i], -moves[i])
     )
     return tuple(FrontPoint(points[i].value, moves_per_hour(points[i], goal.hours), ratios[i]) for i in kept)
-
-
-def _cautions(problem: TrackingProblem) -> tuple[str, ...]:
-    """Limits that exclude the operating point: scenarios rest elsewhere."""
-    model, limits = problem.model, problem.limits
-    outside = (model.u_op < limits.u_min) | (model.u_op > limits.u_max)
-    return tuple(
-        f"the limits of {name}, {low:.5g} to {high:.5g}, exclude the model's operating point, {at:.5g}: scenarios rest "
-        "at the nearest limit instead, from which this input can move one way only; put in limits of the actuator, in "
-        "the model's units and not as deviations, or use a model of where the plant is run"
-        for name, low, high, at, out in zip(
-            model.names.inputs, limits.u_min, limits.u_max, model.u_op, outside, strict=True
-        )
-        if out
-    )
 
 
 def rows_of(points: Sequence[Point], plain: str, hours: float) -> list[dict[str, Any]]:

@@ -97,9 +97,12 @@ def tuning_page(
     result = StudyResult(all_of_them, prepared.model, None, None, runs, tuned.cautions, made)
     group = dict.fromkeys([name for name in shown if name != table.name], "prices")
     first = dict.fromkeys(means, table.name if tuned.is_plain else chosen)
-    of_load = " under the load of each" if by_scenario and len(study.scenarios) > 1 else ""
+    kinds = len(study.scenarios)
+    of_load = (
+        f", {len(baseline.moves) // kinds} under each kind of load," if by_scenario and kinds > 1 else ""
+    )
     told = (
-        f"Moves and errors are means over {len(baseline.moves)} scenarios of tuning{of_load}, on stand-ins for the "
+        f"Moves and errors are means over {len(baseline.moves)} scenarios of tuning{of_load} on stand-ins for the "
         "plant; trajectories are of single runs of the study."
     )
     return interactive_page(result, Means(study, means, group, first, told, outcome))

@@ -38,6 +38,7 @@ QUICK = 12  # planned moves, up to which a search takes a moment
 LARGEST_WEIGHT = 1e9
 LEVEL_TAKES = 20  # samples behind dead times in which a level goes as far as all its inputs can move it
 PLANNED = {1: 5, 2: 5, 3: 4}  # samples with moves, of so many inputs; 3 of more
+THRESHOLD = 0.002  # of the inputs' range
 NEGLIGIBLE = 1e-9  # of the largest: what is rounding
 
 
@@ -80,7 +81,11 @@ def draft(
         move_weight=rounded(within * move_weight), tail_horizon=0.0 if found.unstable else float(horizon),
     )  # fmt: skip
     known_noise = model.noise is not None and bool((model.noise.output > 0).any())
-    noise = model.noise.output if known_noise and model.noise is not None else GUESSED_NOISE * asked
+    noise = (
+        model.noise.output
+        if known_noise and model.noise is not None
+        else GUESSED_NOISE * np.where(asked > 1e-300, asked, 0.0)
+    )
     settling, dead = int(np.ceil(found.settling_time / model.dt)), dead_samples(model)
     every = int(np.clip(1.5 * max(settling - dead, horizon - dead), *CHANGE_LASTS)) + 2 * dead
     highest = highest_price(problem, changes)
@@ -208,6 +213,12 @@ def _reach(change: Array, down: Array, up: Array) -> float:
     with np.errstate(divide="ignore", invalid="ignore"):
         times = np.where(change > 0, up / change, np.where(change < 0, -down / change, np.inf))
     return float(times.min())
+
+
+def usual_threshold(limits: Limits) -> float:
+    """The input change from which on moves count in tables: a 500th of the narrowest range, 0 without limits."""
+    range_ = np.min(limits.u_max - limits.u_min)
+    return float(f"{THRESHOLD * range_:.1g}") if np.isfinite(range_) else 0.0
 
 
 def rounded(values: Array, digits: int = 2) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from mampc.base.checks import Array
 from mampc.base.errors import listed
 from mampc.controllers.offset import HIGHEST_PRICE
-from mampc.study.draft import Draft, draft, rounded
+from mampc.study.draft import Draft, draft, rounded, usual_threshold
 from mampc.systems.properties import Properties, properties, time_in_words
 from mampc.systems.state_space import StateSpace
 
@@ -42,7 +42,7 @@ def _text(model: StateSpace, found: Properties, plan: Draft, file: str, name: st
     first = 5
     steps = first + plan.every * len(changes)
     settled = time_in_words(found.settling_time)
-    threshold = float(f"{0.002 * np.min(limits.u_max - limits.u_min):.1g}")
+    threshold = usual_threshold(limits)
     limit_note = (
         "the range of the record; the valves' own may be wider"
         if plan.known_limits
@@ -76,7 +76,7 @@ output_weight = {_list(np.diag(problem.output_weight))}  # errors count by the c
 move_weight = {_list(np.diag(problem.move_weight))}  # by what inputs do to outputs
 # Limits of the inputs are {limit_note}.
 limits = {{ u_min = {_list(limits.u_min)}, u_max = {_list(limits.u_max)} }}  # also du_max, y_min, y_max
-{_output_ranges(model)}
+{_output_ranges(model)}{_estimator(plan)}
 [reference]
 relative = true  # from the operating outputs {_some(model.y_op)}
 initial = {_list(np.zeros(model.n_outputs))}
@@ -130,6 +130,20 @@ noise = {_list(plan.noise)}
 seed = 0
 # Outputs wandered like this in the record, by loads, drifts and what the model lacks: standard deviation in a sample.
 loads = [{{ kind = "random_walk", at = "output", size = {_list(rounded(model.noise.drift))} }}]
+"""
+
+
+def _estimator(plan: Draft) -> str:
+    """The noise that filters expect, where the model does not know it.
+
+    Its guess from the inputs' range would be beyond changes of reference where inputs act against each other, and plans
+    would wait for data rather than follow.
+    """
+    if plan.known_noise or not plan.noise.all():  # an output that nothing moves has no size
+        return ""
+    return f"""
+[estimator]
+measurement_noise = {_list(plan.noise)}  # what is expected of the sensors: as in the scenarios below
 """
 
 
