@@ -15,6 +15,7 @@ from mampc.systems.state_space import StateSpace
 CLEARLY = 3.0  # by which the log-likelihood has to rise
 SURELY = 8.0  # by which it has to rise in a loop, where it is asked at every sample
 MOST = 0.5  # share of a gain beyond which the model is not one to correct
+OFF_TIME = 0.5  # samples later or sooner, beside a deviation, from which on times of the model count as off
 FEWEST = 60  # samples between corrections, and of all records together
 ALIKE = 20.0  # condition of the gains, inputs and outputs scaled alike, from which on inputs are redundant
 
@@ -66,6 +67,25 @@ def another_model(model: StateSpace, factors: Array) -> str:
     if not np.linalg.cond(_alike(factors * gain)) < ALIKE:
         return "inputs could stand in for each other"
     return ""
+
+
+def another_time(model: StateSpace, delay: Array, deviation: Array) -> str:
+    """Why inputs act at other times than in the model, which gains cannot correct; empty if they do not.
+
+    Args:
+        model: of the plant.
+        delay: samples by which each output answers each input later, shape (l, m).
+        deviation: standard deviations of these, shape (l, m).
+    """
+    sure = np.abs(delay) - deviation
+    if not sure.max() > OFF_TIME:
+        return ""
+    i, j = divmod(int(sure.argmax()), model.n_inputs)
+    when, names = "later" if delay[i, j] > 0 else "sooner", model.names
+    return (
+        f"{names.outputs[i]} answers {names.inputs[j]} by {abs(delay[i, j]):.1f} samples {when} than in the model, "
+        f"give or take {deviation[i, j]:.1f}"
+    )
 
 
 def require_apart(model: StateSpace, noise: Array) -> None:

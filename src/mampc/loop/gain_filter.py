@@ -4,7 +4,9 @@ With x_j the model's response to input j alone, and states x_d and loads w that 
 
     y_i - y_op = sum_j (1 + theta_ij) (C_i x_j + D_ij u_j) + C_i x_d + (loads at the outputs)_i + noise
 
-is linear in theta: a Kalman filter for x_d, w and theta learns it, whatever feedback made the inputs. How far loads
+is linear in theta: a Kalman filter for x_d, w and theta learns it, whatever feedback made the inputs. Dead times and
+lags that are off would pass for gains: what input j did to output i since the last sample, times delta_ij, belongs to
+inputs that act delta_ij samples later than in the model, and is found beside theta, but not used. How far loads
 walk in a sample is left open: filters for small and large steps are mixed by how likely the measurements make them.
 Plants change, so that theta goes back to what is known of it at first, within some `REMEMBERED` samples.
 """
@@ -20,6 +22,7 @@ from mampc.base.identity import equal_only_to_itself
 from mampc.loop.hypotheses import INPUT_NOISE, Loads
 
 PRIOR = 0.15  # standard deviation of a gain's share that is not known
+LATE = 2.0  # standard deviation, in samples, of how much later inputs act than in the model
 REMEMBERED = 10_000.0  # samples within which what was learnt is forgotten
 WALKS = (0.1, 0.3, 1.0, 5.0)  # of loads a sample, in loads that show in the outputs like their noise
 CHANGES = 0.01  # chance that loads begin to walk in another way from one sample to the next
@@ -28,7 +31,7 @@ UNKNOWN = 100.0  # size, in such loads, of what is not known at first
 
 @equal_only_to_itself
 class Belief(NamedTuple):
-    """What the filters know of z = (x_d, w, theta).
+    """What the filters know of z = (x_d, w, delta, theta).
 
     Attributes:
         weights: how likely each way that loads may walk is, shape (F,), with sum 1.
@@ -48,7 +51,7 @@ class Belief(NamedTuple):
 
 
 class GainFilter:
-    """Kalman filters for (x_d, w, theta), one for each way that loads may walk, mixed as in a `LoadBank`; pure.
+    """Kalman filters for (x_d, w, delta, theta), one for each way that loads may walk, mixed as in a `LoadBank`; pure.
 
     Args:
         loads: of the model.
@@ -59,7 +62,10 @@ class GainFilter:
         model, k = loads.model, loads.count
         n = self.n_states = model.n_states + k
         self._shape = model.n_outputs, model.n_inputs
-        size = self._size = model.n_outputs * model.n_inputs if learns else 0
+        channels = model.n_outputs * model.n_inputs
+        known = np.concatenate([np.full(channels, LATE), np.full(channels if learns else 0, PRIOR)])
+        size, self._known = len(known), np.diag(known**2)
+        self._of_theta = slice(n + channels, n + size)
         self._R = np.diag(loads.noise**2)
         kept = np.exp(-1 / REMEMBERED)
         self._A = np.eye(n + size)
@@ -68,10 +74,10 @@ class GainFilter:
         self._C = np.zeros((model.n_outputs, n + size))
         self._C[:, :n] = np.hstack([model.C, loads.on_outputs])
         driven = INPUT_NOISE * loads.on_states
-        of_states, of_loads, of_theta = slice(model.n_states), slice(model.n_states, n), slice(n, None)
+        of_states, of_loads = slice(model.n_states), slice(model.n_states, n)
         self._Q = np.zeros((len(WALKS), n + size, n + size))
         self._Q[:, of_states, of_states] = driven @ driven.T
-        self._Q[:, of_theta, of_theta] = (1 - kept**2) * PRIOR**2 * np.eye(size)
+        self._Q[:, n:, n:] = (1 - kept**2) * self._known
         for Q, walk in zip(self._Q, WALKS, strict=True):
             Q[of_loads, of_loads] = walk**2 * np.eye(k)
         # At first: what loads of unknown size did before.
@@ -87,10 +93,11 @@ class GainFilter:
 
     def initial(self, theta: Array | None = None, P_theta: Array | None = None) -> Belief:
         """Before the first measurement, with what is known of theta, shape (l m,), and its covariance."""
-        n, size, count = self.n_states, self._size, len(WALKS)
+        n, size, count, of_theta = self.n_states, len(self._known), len(WALKS), self._of_theta
         z, P = np.zeros((count, n + size)), np.zeros((count, n + size, n + size))
-        z[:, n:] = 0.0 if theta is None else theta
-        P[:, :n, :n], P[:, n:, n:] = self._start, PRIOR**2 * np.eye(size) if P_theta is None else P_theta
+        P[:, :n, :n], P[:, n:, n:] = self._start, self._known
+        if theta is not None and P_theta is not None:
+            z[:, of_theta], P[:, of_theta, of_theta] = theta, P_theta
         return Belief(np.full(count, 1 / count), z, P)
 
     def predicted(self, belief: Belief) -> Belief:
@@ -102,7 +109,7 @@ class GainFilter:
         return Belief(after, z @ self._A.T, self._A @ P @ self._A.T + self._Q)
 
     def corrected(
-        self, belief: Belief, surplus: Array, each: Array, believed: BoolArray | None = None
+        self, belief: Belief, surplus: Array, each: Array, since: Array, believed: BoolArray | None = None
     ) -> tuple[Belief, float]:
         """What is known after a measurement, and the logarithm of its likelihood before.
 
@@ -110,17 +117,18 @@ class GainFilter:
             belief: predicted.
             surplus: outputs beside what the inputs do to them by the model, shape (l,).
             each: what each input does to each output by the model, shape (l, m).
+            since: what of it came since the last sample, shape (l, m).
             believed: outputs that count, default all.
 
         Raises:
             numpy.linalg.LinAlgError: numbers too far apart.
         """
-        n, (l, m), C = self.n_states, self._shape, self._C
+        n, (l, m), C = self.n_states, self._shape, self._C.copy()
         weights, z, P = belief
-        if self._size:
-            C = C.copy()
-            for i in range(l):
-                C[i, n + i * m : n + (i + 1) * m] = each[i]
+        for i in range(l):
+            C[i, n + i * m : n + (i + 1) * m] = -since[i]
+            if self._of_theta.start < len(C.T):
+                C[i, n + (l + i) * m : n + (l + i + 1) * m] = each[i]
         if believed is not None:
             C, surplus = C * believed[:, None], np.where(believed, surplus, 0.0)
         e = surplus - z @ C.T
@@ -138,14 +146,20 @@ class GainFilter:
         P = rest @ P @ rest.swapaxes(1, 2) + K @ self._R @ K.swapaxes(1, 2)
         return Belief(weights / total, z, P), most + float(np.log(total))
 
+    def delta(self, belief: Belief) -> tuple[Array, Array]:
+        """Mean, shape (l m,), and covariance of delta."""
+        return self._part(belief, slice(self.n_states, self._of_theta.start))
+
     def theta(self, belief: Belief) -> tuple[Array, Array]:
         """Mean, shape (l m,), and covariance of theta."""
-        n = self.n_states
-        return _moments(belief.weights, Belief(belief.weights, belief.z[:, n:], belief.P[:, n:, n:]))
+        return self._part(belief, self._of_theta)
+
+    def _part(self, belief: Belief, own: slice) -> tuple[Array, Array]:
+        return _moments(belief.weights, Belief(belief.weights, belief.z[:, own], belief.P[:, own, own]))
 
     def given(self, belief: Belief, theta: Array) -> Belief:
         """What a filter that learns no theta knows, were this theta, shape (l m,), the right one."""
-        n = self.n_states
+        n = self._of_theta.start
         z, of_theta = belief.z[:, :n], belief.P[:, :n, n:]
         share = np.linalg.solve(belief.P[:, n:, n:], of_theta.swapaxes(1, 2)).swapaxes(1, 2)
         z = z + np.matmul(share, (theta - belief.z[:, n:])[:, :, None])[:, :, 0]

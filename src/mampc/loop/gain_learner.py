@@ -31,6 +31,7 @@ class Learnt(NamedTuple):
         evidence: for other gains than those in force, a log-likelihood, shape (1,).
         begun: all inputs when the filters began, shape (m + d,).
         responses: of the model's states to each input alone since then, shape (n, m + d).
+        did: what each input did to each output by the model at the last sample, shape (l, m).
         weights, z, P: the `Belief` that learns the gains.
         usual_weights, usual_z, usual_P: the one with those in force.
     """
@@ -41,6 +42,7 @@ class Learnt(NamedTuple):
     evidence: Array
     begun: Array
     responses: Array
+    did: Array
     weights: Array
     z: Array
     P: Array
@@ -83,9 +85,8 @@ class GainLearner:
         if before is not None:
             factors, taught, evidence = before.factors, before.taught, before.evidence
             belief = self._learns.initial(*self._learns.theta(before.belief))
-        return Learnt(
-            factors, taught, 0, evidence, inputs, np.zeros((model.n_states, len(inputs))), *belief, *usual
-        )
+        responses, did = np.zeros((model.n_states, len(inputs))), np.zeros(self._shape)
+        return Learnt(factors, taught, 0, evidence, inputs, responses, did, *belief, *usual)
 
     def update(
         self, learnt: Learnt, before: Array, now: Array, y: Array, believed: BoolArray | None = None
@@ -119,27 +120,37 @@ class GainLearner:
         each = model.C @ responses + model.D * now
         surplus, own = y - model.y_op - each.sum(axis=1), each[:, :m]
         off = ((learnt.factors - 1) * own).sum(axis=1)
-        belief, likelihood = self._learns.corrected(belief, surplus, own, believed)
-        usual, otherwise = self._usual.corrected(usual, surplus - off, own, believed)
+        since = own - learnt.did
+        belief, likelihood = self._learns.corrected(belief, surplus, own, since, believed)
+        usual, otherwise = self._usual.corrected(usual, surplus - off, own, since, believed)
         evidence = learnt.evidence * np.exp(-1 / REMEMBERED)
         # Before it knows the states, a filter's surprise says little.
         known = learnt.samples > self._usual.n_states
         if known:
             evidence = evidence + (likelihood - otherwise)
         taught = learnt.taught + int(known and (believed is None or bool(believed.any())))
+        samples = learnt.samples + 1
         return Learnt(
-            learnt.factors, taught, learnt.samples + 1, evidence, learnt.begun, responses, *belief, *usual
+            learnt.factors, taught, samples, evidence, learnt.begun, responses, own, *belief, *usual
         )
 
     def found(self, learnt: Learnt) -> tuple[Array, Array]:
         """Factors of the gains as learnt, and their standard deviations, shapes (l, m)."""
-        theta, covariance = self._learns.theta(learnt.belief)
+        theta, deviation = self._shaped(*self._learns.theta(learnt.belief))
+        return 1 + theta, deviation
+
+    def delay(self, learnt: Learnt) -> tuple[Array, Array]:
+        """Samples by which outputs answer inputs later than in the model, and standard deviations, shapes (l, m)."""
+        return self._shaped(*self._learns.delta(learnt.belief))
+
+    def _shaped(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return 1 + theta.reshape(self._shape), deviation.reshape(self._shape)
+        return mean.reshape(self._shape), deviation.reshape(self._shape)
 
     def taken(self, learnt: Learnt, factors: Array) -> Learnt:
         """With other gains in force."""
         usual = self._learns.given(learnt.belief, factors.ravel() - 1)
-        return Learnt(
-            factors, 0, learnt.samples, np.zeros(1), learnt.begun, learnt.responses, *learnt.belief, *usual
-        )
+        return learnt._replace(
+            factors=factors, taught=0, evidence=np.zeros(1),
+            usual_weights=usual.weights, usual_z=usual.z, usual_P=usual.P,
+        )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 from mampc.base.checks import Array, as_vector, require_finite
 from mampc.base.errors import MampcError
 from mampc.identification.data import IOData
-from mampc.loop.corrected_gains import CLEARLY, FEWEST, another_model, require_apart, with_gains
+from mampc.loop.corrected_gains import CLEARLY, FEWEST, another_model, another_time, require_apart, with_gains
 from mampc.loop.gain_learner import GainLearner
 from mampc.loop.run import Run
 from mampc.systems.noise import white_noise
@@ -84,7 +84,7 @@ def learn_gains(
     (factors, deviation), gained = learner.found(learnt), float(learnt.evidence[0])
     answer = LearntGains(model, False, "", factors, deviation, gained)
     words = f"log-likelihood {gained:+.1f} over {total} samples, each predicted before it was learnt from"
-    against = another_model(model, factors)
+    against = another_model(model, factors) or another_time(model, *learner.delay(learnt))
     if against:
         return replace(answer, reason=f"gains stay: {against}, which calls for another model")
     if not gained > CLEARLY:

@@ -17,7 +17,7 @@ from mampc.base.words import Remark
 from mampc.controllers.controller import Controller
 from mampc.controllers.decision import Decision
 from mampc.loop.change_over import made_anew, taken_over
-from mampc.loop.corrected_gains import FEWEST, SURELY, another_model, require_apart, with_gains
+from mampc.loop.corrected_gains import FEWEST, SURELY, another_model, another_time, require_apart, with_gains
 from mampc.loop.doubt import remembers
 from mampc.loop.estimator import Estimator
 from mampc.loop.gain_learner import GainLearner, Learnt
@@ -126,7 +126,8 @@ class OnlineGains:
         if learnt.taught >= FEWEST and learnt.evidence[0] > SURELY:
             factors, _ = self._learner.found(learnt)
             try:
-                if another_model(self._learner.model, factors):
+                model, delay = self._learner.model, self._learner.delay(learnt)
+                if another_model(model, factors) or another_time(model, *delay):
                     raise MampcError("gains stay")
                 other, taken = self.regulator(factors), self._learner.taken(learnt, factors)
                 estimate = taken_over(after.estimate, regulator.estimator, other.estimator, applied, v)
