@@ -12,7 +12,7 @@ import mampc
 from mampc import loads
 from mampc.base.words import Remark
 from mampc.loop.change_over import taken_over
-from mampc.loop.corrected_gains import FEWEST, MOST, SURELY, another_model, with_gains
+from mampc.loop.corrected_gains import FEWEST, MOST, another_model, with_gains
 from mampc.loop.gain_filter import PRIOR
 from mampc.loop.gain_learner import GainLearner
 from seeds import seeds
@@ -81,6 +81,7 @@ def test_gains_that_are_off_are_found_and_told(plain):
     for k, (before, after) in enumerate(pairwise(factors)):
         assert (before == after).all() is np.bool_(k not in at)
     gains = own.gains(states[-1])
+    assert own.gains(states[at[0] + 1]).evidence == 0.0
     np.testing.assert_array_equal(gains.factors, factors[-1])
     np.testing.assert_allclose(gains.learnt, OFF, atol=0.12)
     np.testing.assert_allclose(gains.factors, OFF, atol=0.2)
@@ -327,9 +328,15 @@ def test_a_loop_that_learns_costs_less_where_gains_are_off(seed):
     assert costs[1] < 1.05 * costs[0]
 
 
-def test_evidence_has_to_be_strong():
-    own, decisions, states, _ = off()
-    first = changes(decisions)[0]
-    evidence = [own.gains(state).evidence for state in states]
-    assert evidence[first] <= SURELY or first == FEWEST + own._online._learner._usual.n_states
-    assert evidence[first + 1] == 0.0
+@pytest.mark.parametrize("seed", seeds(4, quick=2))
+def test_dead_times_and_lags_that_are_off_do_not_pass_for_gains(seed):
+    late = mampc.StateSpace.from_first_order(
+        gain=[[2.0, -0.6], [0.5, 1.5]], time_constant=[[60.0, 95.0], [30.0, 75.0]],
+        dead_time=[[40.0, 20.0], [20.0, 30.0]], dt=10.0,
+    )  # fmt: skip
+    acting = (loads.RandomWalk(size=0.01),)
+    run = mampc.simulate(late, regulator(), asked(400), noise=NOISE, seed=seed, loads=acting, progress=False)
+    assert not changes(run.decisions)
+    found = mampc.learn_gains(MODEL, run, noise=NOISE)
+    assert not found.accepted
+    assert "samples later" in found.reason
