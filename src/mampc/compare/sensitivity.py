@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mampc.base.workers import in_parallel
 from mampc.study.regulators import regulator_of
 from mampc.study.running import Prepared, prepare, run_controller
 from mampc.study.scenario_tables import ScenarioTable
@@ -60,7 +61,7 @@ def sensitivity(
     Raises:
         MampcError: values that do not fit the study.
     """
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
     plain = next(table for table in study.controllers if table.method == "mpc")
     values = [(setting, value) for setting, column in grid.items() for value in column]
@@ -68,8 +69,8 @@ def sensitivity(
     # The settings as they are come up in every column and are run once; a model is identified once a dt.
     tasks = [("dt", study.dt), *((setting, value) for setting, value in values if value != usual[setting])]
     times = sorted({study.dt, *grid.get("dt", [])})
-    parallel = Parallel(n_jobs=jobs, return_as="generator")
-    models = parallel(delayed(prepare)(study.model_copy(update={"dt": dt})) for dt in times)
+    prepare_each = (delayed(prepare)(study.model_copy(update={"dt": dt})) for dt in times)
+    models = in_parallel(prepare_each, jobs)
     prepared = dict(zip(times, models, strict=True))
     work = (
         delayed(_point)(
@@ -78,7 +79,7 @@ def sensitivity(
         for setting, value in tasks
     )
     done: dict[tuple[str, float], Point] = {}
-    for task, point in zip(tasks, parallel(work), strict=True):
+    for task, point in zip(tasks, in_parallel(work, jobs), strict=True):
         done[task] = point
         on_point(len(done), len(tasks))
     as_is = done["dt", study.dt]

@@ -13,6 +13,7 @@ import numpy as np
 from mampc.base.checks import as_jobs
 from mampc.base.errors import MampcError, shown
 from mampc.base.files import made_folder, read_bounded
+from mampc.base.workers import in_parallel
 from mampc.compare.fronts import Point
 from mampc.compare.journal import Journal
 from mampc.compare.knobs import variants
@@ -133,10 +134,10 @@ def _results(
         for task in tasks:
             yield task.name, run_task(sweep, prepared, task)
         return
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
-    parallel = Parallel(n_jobs=jobs, return_as="generator_unordered", max_nbytes=None)
-    yield from parallel(delayed(_named)(sweep, prepared, task) for task in tasks)
+    calls = (delayed(_named)(sweep, prepared, task) for task in tasks)
+    yield from in_parallel(calls, jobs, ordered=False, max_nbytes=None)
 
 
 def _cluster(address: str) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 
 from mampc.base.checks import as_instance, as_jobs, as_whole
 from mampc.base.errors import MampcError
+from mampc.base.workers import in_parallel
 from mampc.compare.candidates import Candidate, candidates, is_dear
 from mampc.compare.fronts import Point, non_dominated
 from mampc.compare.promise import PLAIN, RULES_ALONE, Expected, Goal, moves_per_hour, ratio_over_kinds
@@ -203,10 +204,10 @@ def _run(
         for candidate, prices in parts:
             yield candidate.points(prices, scenarios)
         return
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
-    parallel = Parallel(n_jobs=jobs, return_as="generator", max_nbytes=None)
-    yield from parallel(delayed(candidate.points)(prices, scenarios) for candidate, prices in parts)
+    calls = (delayed(candidate.points)(prices, scenarios) for candidate, prices in parts)
+    yield from in_parallel(calls, jobs, max_nbytes=None)
 
 
 def _confirmed(
@@ -233,13 +234,10 @@ def _at_price(candidate: Candidate, price: float, scenarios: Scenarios, jobs: in
     """The runs of one price; in parallel where each is dear."""
     if jobs == 1 or not candidate.dear:
         return candidate.points([price], scenarios)[0]
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
-    loops = range(len(scenarios))
-    each = Parallel(n_jobs=jobs, max_nbytes=None)(
-        delayed(candidate.points)([price], scenarios.only([loop])) for loop in loops
-    )
-    runs = [point for (point,) in each]
+    calls = (delayed(candidate.points)([price], scenarios.only([loop])) for loop in range(len(scenarios)))
+    runs = [point for (point,) in in_parallel(calls, jobs, max_nbytes=None)]
     moves, error = (np.concatenate([getattr(point, name) for point in runs]) for name in ("moves", "error"))
     return Point(candidate.name, price, moves, error)
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mampc.base.errors import MampcError
+from mampc.base.workers import in_parallel
 from mampc.compare.sensitivity import SETTINGS, Point, holding, sensitivity
 from mampc.report.figures import sensitivity_figure, study_figures
 from mampc.report.folder import ResultFolder
@@ -64,12 +65,12 @@ def reproduce(directory: Path, on_stage: Callable[[str], None] = lambda stage: N
     Raises:
         MampcError: the directory cannot be written, or matplotlib is missing.
     """
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
     folder = ResultFolder(directory, last="report.html")
     studies = [load_study(name) for name in CASES]
     on_stage("both case studies, noise-free and noisy")
-    results = Parallel(n_jobs=-1)(delayed(run_study)(study) for study in studies)
+    results = list(in_parallel((delayed(run_study)(study) for study in studies), -1))
     cases = []
     for result in results:
         study: Study = result.study
