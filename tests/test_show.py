@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import mampc
 from mampc import StateSpace
 from mampc.cli import app
-from mampc.report.showing import model_words
+from mampc.report.showing import model_tables, model_words
 from mampc.systems.evidence import Evidence
 from mampc.systems.noise import Noise
 from mampc.systems.properties import properties
@@ -111,6 +111,16 @@ def test_odd_models_are_no_trouble():
         properties(StateSpace([[-1.0]], [[1.0]], [[1.0]], None, 0.0))
 
 
+@pytest.mark.parametrize(
+    ("unit", "shown"), [("t/h", "mm/(t/h)"), ("kW", "mm/kW"), ("°C", "mm/°C"), ("N m", "mm/(N m)")]
+)
+def test_units_of_gains_say_what_is_below_the_line(unit, shown):
+    names = mampc.Names(("u",), ("y",), units={"u": unit, "y": "mm"})
+    model = StateSpace.from_first_order(gain=1.0, time_constant=60.0, dt=10.0, names=names)
+    [unit_column] = [c for c in model_tables(model)[0].columns if c.header == "unit"]
+    assert list(unit_column.cells) == [shown]
+
+
 def test_print_is_short(column):
     assert str(column).splitlines()[1] == "  y1 from u1: gain 12.8, time constant 16.7 min, dead time 60 s"
     many = StateSpace.from_first_order(
@@ -147,7 +157,7 @@ def test_show_says_what_is_known(column, tmp_path):
     figure = tmp_path / "steps.png"
     outcome = CliRunner().invoke(app, ["show", str(tmp_path / "model.json"), "--figure", str(figure)])
     assert outcome.exit_code == 0, outcome.output
-    for text in ("12.8", "0.5", "%/kg/h", "16.7 min", "noise of the outputs: top 0.1, bottom 0.2", "2.01"):
+    for text in ("12.8", "0.5", "%/(kg/h)", "16.7 min", "noise of the outputs: top 0.1, bottom 0.2", "2.01"):
         assert text in outcome.output
     assert "sign of the gain is uncertain: top from steam" in outcome.output  # 18.9 and 10 of deviation
     assert figure.exists()

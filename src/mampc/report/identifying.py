@@ -132,6 +132,11 @@ def _identified(
             f"the model explains less than {POOR_FIT:g} % of {', '.join(poor)} on the hold-out part; look at the "
             "figure, and try another --order or --detrend, or a richer record"
         )
+        if len(estimation) > 1:
+            doubts.append(
+                f"each of the {len(estimation)} pieces has a constant of its own, so that levels that inputs kept "
+                "within a piece say nothing of their gains; make up short gaps (--fill), or a clock's (--time-zone)"
+            )
     doubts += left_open(model, records)
     return Outcome(
         model, identified.order, identified.fit, replace(rest, u=rest.u.copy(), y=rest.y.copy()), validation,

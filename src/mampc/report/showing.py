@@ -85,7 +85,9 @@ def model_words(model: StateSpace) -> list[str]:
 def _unit(output: str | None, of_input: str | None, integrates: bool) -> str:
     if not output and not of_input:
         return "1/s" if integrates else ""
-    return f"{output or '1'}/{of_input or '1'}" + ("/s" if integrates else "")
+    below = of_input or "1"
+    below = f"({below})" if set("/*· ") & set(below) else below  # t/h
+    return f"{output or '1'}/{below}" + ("/s" if integrates else "")
 
 
 def _named(names: tuple[str, ...], values: Any) -> str:

@@ -273,7 +273,10 @@ class _Reader:
         for what in [what for what in column.marks if what.strip("'\"").casefold() in pair]:
             del column.marks[what]
         off, on = (word.upper() for word in pair)
-        findings.change(f"{column.name}: words read as numbers, {off} as 0 and {on} as 1")
+        findings.change(
+            f"{column.name}: words read as numbers, {off} as 0 and {on} as 1; a controller that is to "
+            "switch it, and take no value between, has levels (rules of a study)"
+        )
 
     def _drop_beyond_reason(self, values: Array, rows: npt.NDArray[np.int64]) -> None:
         for i in np.flatnonzero(np.abs(values) >= LARGEST):
