@@ -373,3 +373,6 @@ def test_values_that_leap_away_or_stay_are_told_and_kept(tmp_path, scale):
     assert "for 15 samples from row 62 on, and moves nearly always elsewhere" in notes(stuck)
     steps = [f"{y[k]:.9g},{np.repeat(u, 4)[k]:.9g}" for k in range(400)]
     assert not notes(steps)
+    test = np.repeat(rng.choice([-1.0, 1.0], 27), 15)[:400]  # of a controller's output, which moves about it
+    moved = [f"{u[k]},{scale * (100 * test[k] + rng.standard_normal()):.9g}" for k in range(400)]
+    assert not notes(moved)

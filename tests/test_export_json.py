@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mampc import MampcError
+from mampc.identification.export import inspect_export
 from test_export_forms import U, Y, assert_whole, read, stamp
 
 RECORDS = [
@@ -82,3 +83,16 @@ def test_records_under_their_tags_are_a_tall_table_and_states_of_the_system_are_
 def test_json_in_other_forms_is_refused(tmp_path, content, message):
     with pytest.raises(MampcError, match=message):
         read(tmp_path, content)
+
+
+def test_one_stream_alone_is_inspected_without_its_flags(tmp_path):
+    path = tmp_path / "export.json"
+    items = [
+        {"Timestamp": r["time"], "Value": r["y"], "Good": True, "Questionable": False, "Annotated": False}
+        for r in RECORDS
+    ]
+    path.write_text(json.dumps({"Links": {}, "Items": items, "UnitsAbbreviation": "m"}))
+    seen = inspect_export(path)
+    assert [column.name for column in seen.columns] == ["Value"]
+    assert "Annotated" in seen.others
+    assert not seen.doubts

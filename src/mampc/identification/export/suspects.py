@@ -13,6 +13,7 @@ from mampc.identification.export.findings import Findings, rows_text
 
 LEAP = 10.0  # times what is seldom exceeded from one sample to the next
 LONGEST_LEAP = 20  # samples; what stays away longer may be a move
+OFTEN = 0.05  # share of samples; what is away more often is moved so
 SHORTEST_STAY = 10  # samples
 CHANCE = 1e-6  # that a stay as long comes about by itself
 
@@ -32,8 +33,8 @@ def note_suspects(name: str, values: Array, numbers: npt.NDArray[np.int64], find
     if not steps.any():
         return
     away = _leaps(steps)
-    if away:
-        rows = [int(numbers[at]) for start, end in away for at in range(start, end)]
+    rows = [int(numbers[at]) for start, end in away for at in range(start, end)]
+    if 0 < len(rows) <= OFTEN * len(values) + 1:
         first = away[0][0]
         findings.note(
             f"{name}: {counted(len(rows), 'value')} far from those before and after, in {rows_text(rows)} (the first "

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from mampc.base.checks import Array
 from mampc.base.errors import MampcError, shown
-from mampc.identification.export.cells import says_numbers
+from mampc.identification.export.cells import STATES, says_numbers
 from mampc.identification.export.clock import Clock, read_clock
 from mampc.identification.export.findings import Findings
 from mampc.identification.export.header import find_column
@@ -122,12 +122,21 @@ def read_table(
 
 
 def _numeric(sheet: Sheet, free: Sequence[int]) -> dict[str, int]:
-    """Columns with numbers in more than half of the first rows' filled cells; of two with one name, the first."""
+    """Columns with numbers in more than half of the first rows' filled cells; of two with one name, the first.
+
+    A switch that holds one word all along is none of them.
+    """
     found: dict[str, int] = {}
     for at in free:
-        if says_numbers(sheet.first(at)):
+        cells = sheet.first(at)
+        if says_numbers(cells) and not (len(set(cells) - {""}) == 1 and _one_word(sheet.words(at))):
             found.setdefault(sheet.header[at], at)
     return found
+
+
+def _one_word(cells: Sequence[str]) -> bool:
+    [word, *others] = {*cells} - {""}
+    return not others and word.casefold() in STATES
 
 
 def origin_of(source: Any) -> str:
