@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -12,12 +12,13 @@ from mampc.base.errors import MampcError, shown
 from mampc.base.identity import equal_only_to_itself
 from mampc.controllers.decision import ControllerState
 from mampc.loop.actuators import LATEST, ActuatorState
-from mampc.loop.corrected_gains import MOST
 from mampc.loop.estimator import Estimate
-from mampc.loop.gain_learner import Learnt
 from mampc.loop.mixing import BankEstimate
 from mampc.loop.sensors import SensorState
 from mampc.program.daqp import active_flags
+
+if TYPE_CHECKING:
+    from mampc.loop.gain_learner import Learnt
 
 FORMAT = "mampc-regulator-state-1"
 
@@ -76,7 +77,7 @@ class RegulatorState(NamedTuple):
                 kind(**estimate),
                 sensors=SensorState(**sensors),
                 actuators=ActuatorState(tuple(actuators.pop("commands")), **actuators),
-                learnt=None if learnt is None else Learnt(**learnt),
+                learnt=None if learnt is None else _learnt(learnt),
                 **numbers,
             )
         except MampcError:
@@ -94,6 +95,12 @@ class RegulatorState(NamedTuple):
         places["measured_disturbance"] = self.measured_disturbance
         places["reference"], places["command"] = self.reference, self.command
         return {place: None if value is None else np.shape(value) for place, value in places.items()}
+
+
+def _learnt(numbers: dict[str, Any]) -> Learnt:
+    from mampc.loop.gain_learner import Learnt
+
+    return Learnt(**numbers)
 
 
 def _numbers(place: str, value: Any) -> Any:
@@ -142,10 +149,13 @@ def fitting_state(text: str, usual: RegulatorState, further: dict[str, tuple[int
             shares = getattr(held, name, np.ones(1))
             if (shares < 0).any() or not abs(shares.sum() - 1) < 1e-9:
                 raise MampcError(f"state: expected {part}.{name} that sum up to 1, received {shares}")
-    if state.learnt is not None and not (np.abs(state.learnt.factors - 1) <= MOST).all():
-        raise MampcError(
-            f"state: expected learnt.factors within {MOST:g} of 1, received {state.learnt.factors}"
-        )
+    if state.learnt is not None:
+        from mampc.loop.corrected_gains import MOST
+
+        if not (np.abs(state.learnt.factors - 1) <= MOST).all():
+            raise MampcError(
+                f"state: expected learnt.factors within {MOST:g} of 1, received {state.learnt.factors}"
+            )
     scale = getattr(state.estimate, "scale", np.ones(1))
     if not (scale > 0).all():
         raise MampcError(f"state: expected positive numbers at estimate.scale, received {scale}")
