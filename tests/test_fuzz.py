@@ -185,7 +185,7 @@ class FaultyLoop(RuleBasedStateMachine):
             decision = self.step(y, None if bounded and sample else by_hand, self.model.v_op)
             held.append(decision.held)
         estimate = decision.state.estimate
-        if max(np.abs(part).max() for part in vars(estimate).values()) > SANE:
+        if max(np.abs(part).max(initial=0.0) for part in vars(estimate).values()) > SANE:
             return  # beyond what a solver can tell from infeasible; it fades away like any other error
         # A prediction that passes by on its way back may have a measurement doubted, until it is confirmed.
         assert not all(held[-max(2, confirm) :])

@@ -193,7 +193,8 @@ def trusted(bank, estimate, plain, h, limit):
         S = member.C @ member.covariance @ member.C.T + member.noise
         share += weight / (1 + h**2 @ np.diag(np.linalg.inv(S)) / len(h) / limit)
         plan = plan + weight * bank.to_plan(b) @ estimate.members[b]
-    share *= bank._hindsight.share(estimate.sums, estimate.scale)
+    if bank._hindsight is not None:
+        share *= bank._hindsight.share(estimate.hindsight, estimate.scale)
     return share * plan + (1 - share) * of_plain
 
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from mampc.base.checks import Array
-from mampc.loop.hindsight import Hindsight
 from mampc.loop.hypotheses import Loads, Member
 from mampc.loop.kalman_filter import KalmanFilter
 
@@ -19,8 +18,8 @@ class Everyday(NamedTuple):
     Attributes:
         of_mixed: from a mixed z, transposed, the same for all hypotheses: to z predicted, innovation and movement
             of the outputs.
-        of_known: from all else, (u, v_last, v, y, 1, late, plain, missed): to the same, and below these to the next
-            `late`, `plain` and `missed`.
+        of_known: from all else, (u, v_last, v, y, 1, late, plain): to the same, and below these to the next `late`
+            and `plain`, and to what the plain filter missed of the outputs, in standard deviations of their noise.
         parts: the rows of each of these four.
     """
 
@@ -29,9 +28,7 @@ class Everyday(NamedTuple):
     parts: list[slice]
 
 
-def everyday(
-    loads: Loads, member: Member, of_late: Array, plain: KalmanFilter, hindsight: Hindsight
-) -> Everyday:
+def everyday(loads: Loads, member: Member, of_late: Array, plain: KalmanFilter) -> Everyday:
     """The maps of a bank with these loads, of which `member` is one hypothesis.
 
     Args:
@@ -39,8 +36,8 @@ def everyday(
     """
     model, k = plain.model, loads.count
     n, m, l, d = model.n_states, model.n_inputs, model.n_outputs, model.n_disturbances
-    sizes = (m, d, d, l, 1, len(of_late), n + l + m, len(hindsight.misses))
-    u, v_last, v, y, one, late, filtered, missed = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
+    sizes = (m, d, d, l, 1, len(of_late), n + l + m)
+    u, v_last, v, y, one, late, filtered = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
     op = np.outer(model.all_inputs_op, one)
     drive = model.B @ (np.vstack([u, v_last]) - op)
     surplus = y - np.outer(model.y_op, one) - model.D @ (np.vstack([u, v]) - op)
@@ -55,7 +52,7 @@ def everyday(
         np.vstack([driven, surplus - C @ driven, model.C @ drive]),
         of_late @ np.vstack([late, u]),
         next_filtered,
-        hindsight.misses @ np.vstack([missed, innovation / loads.noise[:, None]]),
+        innovation / loads.noise[:, None],
     ]
     ends = [0, *np.cumsum([len(part) for part in nexts]).tolist()]
     return Everyday(np.ascontiguousarray(of_z.T), np.vstack(nexts), [slice(*pair) for pair in pairwise(ends)])

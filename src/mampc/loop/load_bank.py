@@ -14,8 +14,8 @@ last samples did to the outputs, dead times aside, h, their innovations may be o
 diag(S_b^-1) h / l times as much, and what is corrected falls by as much (but where modes integrate or grow, and errors
 would not fade). Meanwhile plans count on the bank with the weight t = sum_b mu_b t_b, and for the rest on the plain
 filter that a regulator would have without a bank: that one follows slowly, and in one way whatever happens, so that a
-wrong model costs little more with a bank than without. Where the model resonates, plans count on the bank by what of it
-came true besides (`hindsight`). The factor of the noise counts up to one here: errors of the
+wrong model costs little more with a bank than without. Where the model resonates, integrates or grows, plans count on
+the bank by what of it came true besides (`hindsight`). The factor of the noise counts up to one here: errors of the
 model, which make it larger, are no reason for less caution. Where the noise was guessed it counts as the least it can
 be, since moves may be far above the noise and within its guess.
 
@@ -36,7 +36,7 @@ from mampc.loop.doubt import moves_of_late, remembers
 from mampc.loop.estimator import Estimate, Estimator, Updated
 from mampc.loop.everyday import everyday
 from mampc.loop.guessed_noise import guessed_noise
-from mampc.loop.hindsight import Hindsight, compared
+from mampc.loop.hindsight import Hindsight, resonates
 from mampc.loop.hypotheses import HYPOTHESES, Hypothesis, Loads, Member
 from mampc.loop.kalman_filter import KalmanFilter
 from mampc.loop.mixing import NOISE_RANGE, BankEstimate, Filters, Mixing, bank_estimate, filters_of
@@ -118,7 +118,9 @@ class LoadBank(Estimator):
         self._damps = not remembers(
             model
         )  # where a mode integrates or grows errors stay, and are corrected in full
-        self._hindsight = Hindsight(self._planning_model, self.plain, sizes)
+        self._swings, self._hindsight = resonates(model), None
+        if self._swings or not self._damps:  # elsewhere what was foretold wrongly fades, and costs little
+            self._hindsight = Hindsight(self._planning_model, self.plain, sizes)
         self._of_loads = slice(model.n_states, model.n_states + self.loads.count)
         # The members' models differ in how s goes on: all may have the same A once their mixed z are multiplied by
         # `_begins` before, and by `_goes_on` after.
@@ -126,8 +128,7 @@ class LoadBank(Estimator):
         lasting = np.ones((len(kept), model.n_states + self.loads.count))
         self._begins = np.hstack([lasting, np.repeat(kept > 0, self.loads.count, axis=1)])
         self._goes_on = np.hstack([lasting, np.repeat(kept, self.loads.count, axis=1)])
-        self._everyday = everyday(self.loads, self.members[0], self._of_late, self.plain, self._hindsight)
-        self._nothing = np.zeros(l)
+        self._everyday = everyday(self.loads, self.members[0], self._of_late, self.plain)
 
     @classmethod
     def for_problem(cls, problem: TrackingProblem, *, noise: Any = None) -> LoadBank:
@@ -174,11 +175,11 @@ class LoadBank(Estimator):
         goes with it.
         """
         bank = bank_estimate(estimate)
-        if not self._hindsight.counts:
+        if self._hindsight is None or not self._swings:
             return bank.weights * bank.scale[..., :1]
         moved = np.square(bank.late[..., self._moved]) @ self._everything.precisions.T
         doubt = moved / np.minimum(bank.scale[..., :1], 1.0)
-        counts = (bank.weights / (1 + doubt)).sum(axis=-1) * self._hindsight.share(bank.sums, bank.scale)
+        counts = (bank.weights / (1 + doubt)).sum(axis=-1) * self._hindsight.share(bank.hindsight, bank.scale)
         weights: Array = bank.weights * bank.scale[..., :1] * np.square(counts)[..., None]
         return weights
 
@@ -204,9 +205,8 @@ class LoadBank(Estimator):
     def with_parts(self, bank: BankEstimate, members: Array, plain: Estimate) -> BankEstimate:
         """The estimate with other z of each hypothesis, shape (B, n + 2k), and another one of the plain filter."""
         counts = self._counts(bank.weights, bank.late, bank.scale)
-        hindsight = bank.missed, bank.foretold.copy(), bank.sums
         return self._estimate(
-            members, bank.weights, bank.usual, bank.scale, bank.late, plain.flat, counts, hindsight
+            members, bank.weights, bank.usual, bank.scale, bank.late, plain.flat, counts, bank.hindsight
         )
 
     def initial(self, u: Array, y: Any = None, v: Array | None = None) -> BankEstimate:
@@ -222,16 +222,13 @@ class LoadBank(Estimator):
         scale = np.array([1.0, self._told])
         plain = self.plain.initial(u, y, v).flat
         chances = usual @ self._mixing.chances
-        h, l = self._hindsight.horizon, model.n_outputs
-        hindsight = np.zeros(h * l), np.zeros((h + 1) * l), np.zeros(2)
+        hindsight = np.zeros(0) if self._hindsight is None else self._hindsight.initial
         return self._estimate(members, chances, usual, scale, late, plain, 1.0, hindsight)
 
     def update(self, last: Estimate, u: Array, y: Array, v_last: Array, v: Array) -> Updated | None:
         """Predict and correct every hypothesis, with every output believed; None if some number is not usable."""
         bank, l, n_z = bank_estimate(last), len(y), len(self._everyday.of_mixed)
-        known = np.concatenate(
-            (bank.members.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain, bank.missed)
-        )
+        known = np.concatenate((bank.members.ravel(), u, v_last, v, y, _ONE, bank.late, bank.plain))
         if not is_usable(known):
             return None
         c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
@@ -239,14 +236,10 @@ class LoadBank(Estimator):
         told, each = self._everyday.of_known.dot(known[mixed.size :]), mixed.dot(self._everyday.of_mixed)
         each += told[: n_z + 2 * l]
         _, late, plain, missed = (told[part] for part in self._everyday.parts)
-        foretold, sums = bank.foretold, bank.sums
-        if self._hindsight.counts:
-            foretold = np.concatenate((self._nothing, foretold[:-l]))
-            sums = compared(sums, foretold[-l:], missed[:l])
         seen = c.dot(each[:, n_z:])  # innovation and movement of the mixture
         estimate = self._weighed(
             each[:, :n_z] * self._goes_on, each[:, n_z : n_z + l].ravel(),
-            late, plain, c, bank, self._everything, (missed, foretold, sums),
+            late, plain, c, bank, self._everything, self._later(bank.hindsight, missed),
         )  # fmt: skip
         return Updated(estimate, seen[:l], seen[l:])
 
@@ -258,15 +251,12 @@ class LoadBank(Estimator):
             len(self._everyday.of_mixed),
             self._everything,
         )
-        known = np.concatenate(
-            (u, v_last, v, y, np.ones((len(y), 1)), bank.late, bank.plain, bank.missed), axis=1
-        )
+        known = np.concatenate((u, v_last, v, y, np.ones((len(y), 1)), bank.late, bank.plain), axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
             c, mixed = self._mixing.before(bank.weights, bank.usual, bank.members)
             told = known @ self._everyday.of_known.T
             each, late, plain, missed = (told[:, part] for part in self._everyday.parts)
-            foretold = np.concatenate((np.zeros_like(y), bank.foretold[:, :-l]), axis=1)
-            hindsight = missed, foretold, compared(bank.sums, foretold[:, -l:], missed[:, :l])
+            hindsight = self._later(bank.hindsight, missed)
             each = (mixed * self._begins) @ self._everyday.of_mixed + each[:, None]
             seen = np.einsum("sb,sbi->si", c, each[:, :, n_z:])
             innovations = each[:, :, n_z : n_z + l].reshape(len(y), -1)
@@ -291,9 +281,9 @@ class LoadBank(Estimator):
         members[:, : model.n_states] += model.B @ self._change(u, v)
         late = self._of_late.dot(np.concatenate((bank.late, u)))
         plain = self.plain.predict(self.plain_of(bank), u, v).flat
-        counts, l = self._counts(c, late, bank.scale), model.n_outputs
-        missed = self._hindsight.misses.dot(np.concatenate((bank.missed, self._nothing)))
-        hindsight = missed, np.concatenate((self._nothing, bank.foretold[:-l])), bank.sums
+        counts, hindsight = self._counts(c, late, bank.scale), bank.hindsight
+        if self._hindsight is not None:
+            hindsight = self._hindsight.predicted(hindsight)
         return self._estimate(members, c, bank.usual, bank.scale, late, plain, counts, hindsight)
 
     def innovation(self, predicted: Estimate, u: Array, y: Array, v: Array | None = None) -> Array:
@@ -314,14 +304,9 @@ class LoadBank(Estimator):
         seen_beside = bank.weights @ seen + self.plain.innovation(plain, model.u_op, model.y_op)
         off = np.where(believed, innovation + seen_beside, 0.0)
         corrected = self.plain.corrected(plain, off, believed).flat
-        missed, l = bank.missed.copy(), len(off)
-        missed[:l] += off / self.noise
-        missed[l : 2 * l] = off / self.noise
-        hindsight = (
-            missed,
-            bank.foretold.copy(),
-            compared(bank.sums, bank.foretold[-l:] * believed, missed[:l]),
-        )
+        hindsight = bank.hindsight
+        if self._hindsight is not None:
+            hindsight = self._hindsight.corrected(hindsight, off / self.noise, believed)
         return self._weighed(
             bank.members, each.ravel(), bank.late, corrected, bank.weights, bank, filters, hindsight
         )
@@ -336,7 +321,7 @@ class LoadBank(Estimator):
 
     def _weighed(
         self, members: Array, innovations: Array, late: Array, plain: Array, c: Array, bank: BankEstimate,
-        filters: Filters, hindsight: tuple[Array, Array, Array],
+        filters: Filters, hindsight: Array,
     ) -> BankEstimate:  # fmt: skip
         """The estimate after Bayes' rule.
 
@@ -345,7 +330,7 @@ class LoadBank(Estimator):
             innovations: of one hypothesis after the other, shape (B l,).
             late, plain: of the estimate, predicted, and the latter corrected.
             c: how likely each hypothesis was before, shape (B,).
-            hindsight: of the estimate, as `_estimate` takes it.
+            hindsight: of the estimate, with what came.
         """
         surprise = self._of_each.dot(np.square(filters.whiten.dot(innovations)))
         moved = filters.precisions.dot(np.square(late[self._moved]))
@@ -363,27 +348,29 @@ class LoadBank(Estimator):
 
     def _estimate(
         self, members: Array, weights: Array, usual: Array, scale: Array, late: Array, plain: Array, counts: Any,
-        hindsight: tuple[Array, Array, Array],
+        hindsight: Array,
     ) -> BankEstimate:  # fmt: skip
         """The estimate whose plans count on the bank with the weight t, `counts`, times its share in hindsight, and
         else on the plain filter.
-
-        Args:
-            hindsight: `missed`, `foretold` and `sums`; what is foretold now is written to the second.
         """
-        missed, foretold, sums = hindsight
         each = (weights[..., None] * members).reshape((*weights.shape[:-1], -1))
         plan = plain.dot(self._plain_part)
         beside = each.dot(self._mixture) - plan
-        if self._hindsight.counts:
-            foretold[..., : self.model.n_outputs] = beside.dot(self._hindsight.foretells.T)
-            counts = counts * self._hindsight.share(sums, scale)[..., None]
+        if self._hindsight is not None:
+            hindsight = self._hindsight.foretelling(hindsight, beside)
+            counts = counts * self._hindsight.share(hindsight, scale)[..., None]
         plan += counts * beside
         x, at_inputs, at_outputs = self._parts
         return BankEstimate(
             plan[..., x], plan[..., at_outputs], plan[..., at_inputs],
-            members, weights, usual, scale, late, plain, missed, foretold, sums,
+            members, weights, usual, scale, late, plain, hindsight,
         )  # fmt: skip
+
+    def _later(self, hindsight: Array, missed: Array) -> Array:
+        """The hindsight a sample later, at which the plain filter missed so much of the outputs (..., l)."""
+        if self._hindsight is None:
+            return hindsight
+        return self._hindsight.corrected(self._hindsight.predicted(hindsight), missed)
 
     def plain_of(self, bank: BankEstimate) -> Estimate:
         """What the plain filter estimates."""

@@ -43,7 +43,7 @@ class BankEstimate(Estimate):
         late: what the inputs' moves of the last samples did to the outputs (l,), these moves (N, m) with the latest
             first, and the inputs (m,), one behind the other.
         plain: x, d_y and d_u of the plain filter, shape (n + l + m,).
-        missed, foretold, sums: what `Hindsight` compares, shapes (h l,), ((h + 1) l,) and (2,); the latest is first.
+        hindsight: what `Hindsight` remembers; empty without it.
     """
 
     members: Array
@@ -52,9 +52,7 @@ class BankEstimate(Estimate):
     scale: Array
     late: Array
     plain: Array
-    missed: Array
-    foretold: Array
-    sums: Array
+    hindsight: Array
 
 
 def bank_estimate(estimate: Estimate) -> BankEstimate:

@@ -159,9 +159,9 @@ def fitting_state(text: str, usual: RegulatorState, further: dict[str, tuple[int
     scale = getattr(state.estimate, "scale", np.ones(1))
     if not (scale > 0).all():
         raise MampcError(f"state: expected positive numbers at estimate.scale, received {scale}")
-    squares = getattr(state.estimate, "sums", np.zeros(2))[1]
-    if squares < 0:
-        raise MampcError(f"state: expected a sum of squares at estimate.sums, received {squares}")
+    squares = getattr(state.estimate, "hindsight", np.empty(0))[1:2]
+    if (squares < 0).any():
+        raise MampcError(f"state: expected a sum of squares at estimate.hindsight, received {squares}")
     if not active_flags(state.controller.active):
         raise MampcError(f"state: expected flags at controller.active, received {state.controller.active}")
     late = state.actuators.late
