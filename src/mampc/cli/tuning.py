@@ -147,7 +147,7 @@ def _share(text: str) -> float:
     share = number("--max-error-increase", text, expected)
     signed = text.strip().endswith("%")
     if not 0 < share <= LARGEST_INCREASE:
-        expected += "" if signed or not share > 1 else f", here {text.strip()}%"
+        expected += f", here {text.strip()}%" if not signed and 1 < share <= 100 * LARGEST_INCREASE else ""
         raise MampcError(f"--max-error-increase: expected {expected}, received {shown(text)}")
     if share > 1 and not signed:
         raise MampcError(

@@ -115,6 +115,8 @@ class HeuristicSearch:
             ended, status = Ended(best.solved), Status.TIME_LIMIT
         except StopIteration as end:
             ended = end.value
+            if perf_counter() > deadline:  # what was tried last may have been cut short
+                status = Status.TIME_LIMIT
         best.offer(solver.solve(sample, np.zeros(self.condensed.n_moves, dtype=bool), best.objective))
         guess, remarks = self._shifted(ended.moves), self._remarks(allowance)
         if best.moves is not None:
