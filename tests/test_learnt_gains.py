@@ -146,12 +146,13 @@ def test_a_loop_goes_on_with_learnt_gains_without_a_bump_and_with_less_error(see
 
     old, first, second = regulator(MODEL), range(200), range(200, 400)
     u, y, state, x = went_on(old, old.initial_state(), np.zeros(plant.n_states), first)
-    new = regulator(mampc.learn_gains(MODEL, mampc.IOData(u, y, MODEL.dt), noise=NOISE).model)
+    found = mampc.learn_gains(MODEL, mampc.IOData(u, y, MODEL.dt), noise=NOISE)
+    new = regulator(found.model)
     kept = went_on(old, state, x, second)
     learnt = went_on(new, new.initial_state(u[-10:], y[-1]), x, second)
     error, moves = [], []
     for inputs, outputs, *_ in (kept, learnt):
         error.append(np.mean(((outputs - reference[200:]) / NOISE) ** 2))
         moves.append(np.count_nonzero(np.diff(np.vstack([u[-1:], inputs[:10]]), axis=0)))
-    assert error[1] < 1.02 * error[0]
+    assert error[1] < error[0] or not found.accepted  # else it only forgot what its estimator knew
     assert moves[1] <= moves[0] + 1
