@@ -1,6 +1,6 @@
 """What tuning promises beside what it keeps: plants and loads that it never saw, one by one.
 
-    python benchmarks/tuned.py [--plants "3 x 3 column" tank]
+    python benchmarks/tuned.py [--plants "3 x 3 column" tank level]
 
 `mampc.tune` is given a model, its limits and 25 %, with the noise told and not; the controller found and plain MPC then
 run on the benchmark's plant, which is off the model, under each kind of load alone, in eight scenarios. The promise is
@@ -19,7 +19,7 @@ from measuring import options
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--plants", nargs="*", default=["3 x 3 column", "tank"])
+    parser.add_argument("--plants", nargs="*", default=["3 x 3 column", "tank", "level"])
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
     for name in given.plants:
