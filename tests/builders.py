@@ -156,3 +156,17 @@ def load_bank(problem):
         return mampc.LoadBank.for_problem(problem)
     except mampc.MampcError:
         return mampc.LoadBank(problem.model, noise=0.05)
+
+
+def random_problem(seed, **changes):
+    """A problem with limits of its inputs, a state, a reference and inputs applied, off their operating point."""
+    model = random_model(seed, n=3, m=2, l=2)
+    settings = {
+        "prediction_horizon": 8, "control_horizon": 4,
+        "limits": mampc.Limits(u_min=model.u_op - 1, u_max=model.u_op + 1),
+    }  # fmt: skip
+    rng = np.random.default_rng(seed)
+    return (
+        mampc.TrackingProblem(model, **(settings | changes)), rng.standard_normal(3),
+        model.y_op + rng.standard_normal(2), model.u_op + rng.uniform(-1, 1, 2),
+    )  # fmt: skip

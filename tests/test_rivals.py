@@ -1,13 +1,11 @@
 """Rivals solve the problems that the literature states, and run like any controller."""
 
-from itertools import product
-
 import cvxpy as cp
 import numpy as np
 import pytest
 
 import mampc
-from builders import random_model, tank_model, tank_problem
+from builders import random_model, random_problem, tank_model, tank_problem
 from mampc import rivals
 from mampc.program.qp import QPStatus, QuadraticProgram
 from mampc.rivals.norms import Norm, NormsSolver
@@ -32,19 +30,6 @@ OTHERS = {
     "sparse": lambda p: rivals.SparseInputs(p, most=1),
 }
 ALL = {**{name: lambda p, r=rule: r(mampc.MPC(p)) for name, rule in RULES.items()}, **OTHERS}
-
-
-def random_problem(seed, **changes):
-    model = random_model(seed, n=3, m=2, l=2)
-    settings = {
-        "prediction_horizon": 8, "control_horizon": 4,
-        "limits": mampc.Limits(u_min=model.u_op - 1, u_max=model.u_op + 1),
-    }  # fmt: skip
-    rng = np.random.default_rng(seed)
-    return (
-        mampc.TrackingProblem(model, **(settings | changes)), rng.standard_normal(3),
-        model.y_op + rng.standard_normal(2), model.u_op + rng.uniform(-1, 1, 2),
-    )  # fmt: skip
 
 
 def convex(problem, x, reference, u, penalty, *, on="moves", u_s=None, extra=None):
@@ -232,28 +217,6 @@ def test_rounds_never_raise_a_concave_objective_and_end_where_it_is_stationary(p
         assert near >= value - 1e-6 * 1e-2 * abs(value)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_few_inputs_at_each_instant_are_the_best_of_all_patterns(seed):
-    problem, x, reference, u = random_problem(seed, control_horizon=2)
-    controller = rivals.SparseInputs(problem, most=1)
-    decision = controller.step(controller.initial_state(u), x, reference)
-    parameter = controller.condensed.parameter.vector(x, u, reference)
-    u_s = mampc.program.steady.SteadyTarget(problem, controller.condensed.parameter).at(parameter).u
-    condensed = controller.condensed
-    sample = condensed.sample(parameter, u)
-    best = np.inf
-    for pattern in product([(True, False), (False, True)], repeat=2):
-        plan = cp.Variable((2, 2))
-        d = cp.hstack([plan[0] - u, plan[1] - plan[0]])
-        cost = cp.sum_squares(condensed.U @ d - sample.target) + sample.cost
-        rows = [plan >= np.tile(problem.limits.u_min, (2, 1)), plan <= np.tile(problem.limits.u_max, (2, 1))]
-        rows += [plan[j][a] == u_s[a] for j in range(2) for a in range(2) if not pattern[j][a]]
-        program = cp.Problem(cp.Minimize(cost), rows)
-        best = min(best, program.solve(solver=cp.CLARABEL))
-    assert decision.objective == pytest.approx(best, rel=1e-6)
-    assert ((np.abs(decision.plan - u_s) > 1e-9).sum(axis=1) <= 1).all()
-
-
 # Self-triggered control waits for loads that fade as it does for the plant: its function counts all states alike.
 @pytest.mark.parametrize(
     ("name", "bank"), [(n, bank) for n in ALL for bank in (False, True) if (n, bank) != ("self", True)]
@@ -308,19 +271,6 @@ def test_units_decide_nothing(name):
         return run.u / by
 
     np.testing.assert_allclose(inputs(scale), inputs(np.ones(2)), rtol=1e-4, atol=1e-3)
-
-
-def test_small_inputs_move_beside_large_ones():
-    def changes(scale):
-        model = tank_model()
-        other = mampc.StateSpace(
-            model.A, model.B / scale, model.C, model.D / scale, model.dt, model.u_op * scale, model.y_op
-        )
-        problem = tank_problem(other, limits=mampc.Limits(), move_weight=0.1 / scale**2)
-        controller = rivals.SparseInputs(problem, most=1)
-        return controller.step(controller.initial_state(), np.zeros(4), [34.0, 28.0]).changes / scale
-
-    np.testing.assert_allclose(changes(np.array([1e-9, 1e6])), changes(np.ones(2)), rtol=1e-6, atol=1e-6)
 
 
 def test_a_dead_band_moves_by_more_than_its_size_or_not_at_all():
